@@ -7,10 +7,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import re
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,7 +24,15 @@ from progdf.compose import layer_paint
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import numbered_names, replace_file
+from progdf.io.atomic import (
+    LockedError,
+    hold_lock,
+    is_locked,
+    make_folder,
+    numbered_names,
+    replace_file,
+    state_folder,
+)
 from progdf.io.session import (
     SUFFIX,
     EditRef,
@@ -278,12 +288,52 @@ def session_file(path: Path) -> Path:
     return path if path.suffix == ".json" else path.with_name(path.name + SUFFIX)
 
 
+class Claim:
+    """Lock on a session or autosave while a window has it open. The system releases it after a crash."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._held = ExitStack()
+
+    def take(self, path: Path) -> bool:
+        """Lock a file that need not exist, instead of the earlier one; return False if a window has it."""
+        if path == self._path:
+            return True
+        self.release()
+        try:
+            make_folder(_lock_file(path).parent)
+            self._held.enter_context(hold_lock(_lock_file(path)))
+        except LockedError:
+            return False
+        except (ProgdfError, OSError):  # without a writable state folder, nothing is locked
+            return True
+        self._path = path
+        return True
+
+    def release(self) -> None:
+        """Release the lock."""
+        self._held.close()
+        self._path = None
+
+
+def is_claimed(path: Path) -> bool:
+    """Return whether a running window has a session or autosave open."""
+    return is_locked(_lock_file(path))
+
+
+def _lock_file(path: Path) -> Path:
+    """Return the lock file of a session or autosave, outside its folder, which may be shared or read-only."""
+    digest = hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16]
+    return state_folder() / "open" / f"{digest}.lock"
+
+
 class SessionAutosave:
     """Autosave of one window. It never overwrites the autosave of another window."""
 
     def __init__(self) -> None:
         self.path: Path | None = None
         """Path of its file, None before the first autosave."""
+        self._claim = Claim()
         self._due: float | None = None  # time of the next autosave
         self._work: object = None  # content of the file
 
@@ -317,6 +367,7 @@ class SessionAutosave:
         self._work = work
         if self.path is None:
             self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
+            self._claim.take(self.path)
         save(self.path)
         return self.path
 
@@ -327,6 +378,7 @@ class SessionAutosave:
     def continue_from(self, path: Path) -> None:
         """Take over the file of an opened autosave."""
         self.path = path
+        self._claim.take(path)
         self._due = None
         self._work = None
 
@@ -334,6 +386,7 @@ class SessionAutosave:
         """Delete the file, as its work is saved."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
+        self.release()
         self.path = None
         self._due = None
         self._work = None
@@ -341,10 +394,15 @@ class SessionAutosave:
     def discard(self) -> Path | None:
         """Move the file to discarded work. Return its new path, or None if there is no file."""
         path = self.path
+        self.release()
         self.path = None
         self._due = None
         self._work = None
         return put_aside(path) if path is not None and path.exists() else None
+
+    def release(self) -> None:
+        """Release the lock of the file, so that another window offers to restore it."""
+        self._claim.release()
 
 
 def session_of(path: Path) -> Path | None:

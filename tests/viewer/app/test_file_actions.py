@@ -176,6 +176,29 @@ def left_over(window: application.App, folder: Path) -> Path:
 
 
 @pytest.mark.gl
+def test_work_of_a_running_window_is_not_offered(window: application.App, folder: Path) -> None:
+    press(window, "Shift+Left")
+    beside = left_over(window, folder)
+    other = session.Claim()
+    assert other.take(beside)
+    window.parts.file_actions.offer_autosave()
+    assert window.main_view.work.dialog is None
+    other.release()  # as the system does for a window that crashes
+    window.parts.file_actions.offer_autosave()
+    assert question(window).kind == "restore"
+
+
+@pytest.mark.gl
+def test_second_window_on_a_scene_names_the_first(window: application.App, folder: Path) -> None:
+    window.parts.file_actions.release()
+    other = session.Claim()
+    assert other.take(folder / "bear.session.json")
+    window.parts.file_actions.open(folder / "bear.ply")
+    assert message(window) == "bear is open in another window"
+    other.release()
+
+
+@pytest.mark.gl
 def test_new_autosave_never_replaces_a_leftover_autosave(window: application.App, folder: Path) -> None:
     press(window, "Shift+Left")
     beside = left_over(window, folder)

@@ -28,7 +28,7 @@ from viewer.app.parts.edits import EditActions
 from viewer.app.parts.pictures import PictureActions
 from viewer.camera.view_camera import ViewCamera, first_camera
 from viewer.files import document, region_files, session
-from viewer.files.session import SessionAutosave, WindowSession, session_file
+from viewer.files.session import Claim, SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import keys_file, parse_path, read_keys, read_recent, remember_recent, write_keys
 from viewer.panel import dialogs
 from viewer.state import workspace
@@ -81,6 +81,7 @@ class FileActions:
         self._leave = leave
         self.path = path
         self.session_autosave = SessionAutosave()
+        self._claim = Claim()
         self._put_off: set[Path] = set()  # autosaves that the user decides about later
         self._browser = dialogs.Browser()
         opened = documents.get()
@@ -182,6 +183,7 @@ class FileActions:
         for region in self._store.get().view.selection.regions:
             region_files.region_file(region, len(self._documents.get().original))
         self.session_autosave.drop()
+        self._claim.take(path)
         self.path = path
         self._store.replace(workspace.mark_saved(self._store.get()))
         self._remember(path)
@@ -224,8 +226,10 @@ class FileActions:
         self.session_autosave.drop()
 
     def release(self) -> None:
-        """Close the system file dialog, if it is still open."""
+        """Close the system file dialog, if it is still open, and release the open files."""
         self._browser.close()
+        self._claim.release()
+        self.session_autosave.release()
 
     def _open(self, path: Path, kind: str) -> None:
         if self._documents.get().is_empty and kind in ("picture", "cameras", "gdf"):
@@ -243,7 +247,7 @@ class FileActions:
                 if "made for another scene" not in str(error):
                     raise
                 line = f"{path.name} was made for another scene"
-                self._messages.show(line, True, button=("Rebind…", WithText("rebind", str(path))))
+                self._messages.offer(line, ("Rebind…", WithText("rebind", str(path))), error=True)
                 return
         elif self.has_unsaved:
             self._messages.ask(self._closing_question(WithText("open_file", str(path))))
@@ -274,11 +278,18 @@ class FileActions:
             self._messages.show(f"Restored the unsaved work of {saved.name}")
 
     def offer_autosave(self) -> None:
-        """Ask about the latest autosave of an earlier window, if there is any."""
+        """Ask about the latest autosave of a window that is gone, if there is any.
+
+        A message reports that another window has the same session open.
+        """
         if self._documents.get().path is None:
             return
-        paths = session.find_autosaves(self._session_name(), numbered=self.path is None)
-        new = [path for path in paths if path != self.session_autosave.path and path not in self._put_off]
+        name = self._session_name()
+        if not self._claim.take(name):
+            self._messages.show(f"{session.stem(name)} is open in another window")
+        own = (self.session_autosave.path, *self._put_off)
+        paths = session.find_autosaves(name, numbered=self.path is None)
+        new = [path for path in paths if path not in own and not session.is_claimed(path)]
         if new:
             self._put_off.add(new[0])  # in case the user does not decide now
             self._messages.ask(Dialog("restore", str(new[0])))
