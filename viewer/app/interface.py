@@ -282,7 +282,36 @@ def panels(
     work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
     work = replace(work, view=view_settings.draw_view(work.view, above, foot, ui, actions))
     work, asked = draw_pill(work, pointer, compared, foot)
-    return perform_actions(work, [*actions, *asked], pointer)
+    work = perform_actions(work, [*actions, *asked], pointer)
+    return _draw_question(_open_settings(work), pointer)
+
+
+def _open_settings(work: Workspace) -> Workspace:
+    """Open the menu of the view settings if that was requested."""
+    window = imgui.internal.find_window_by_name("view")
+    if work.settings_opening and window is not None and window.active:
+        imgui.open_popup(window.get_id("view settings"))
+    return replace(work, settings_opening=False)
+
+
+def _draw_question(work: Workspace, pointer: PointerContext) -> Workspace:
+    """Draw the question, if there is one, below the axes, and below all bars of a narrow picture."""
+    question = work.question
+    if question is None:
+        return work
+    ui = pointer.ui
+    area = pointer.area
+    edge = tools.EDGE_PX * ui.scale
+    is_narrow = area.width < tools.NARROW_PX * ui.scale
+    above = [imgui.internal.find_window_by_name(name) for name in ("view", "options", "placing")]
+    shown = [window for window in above[: 3 if is_narrow else 1] if window is not None and window.was_active]
+    top = max((window.pos.y + window.size.y for window in shown), default=0.0) + edge
+    room = area.width - tools.LEFT_PX * ui.scale - edge
+    pressed = overlay.question(question, (area.width - edge, top), room, ui)
+    if pressed is None:
+        return work
+    work = replace(work, question=None)
+    return perform_actions(work, [pressed] if pressed else [], pointer)
 
 
 def _active_tool(work: Workspace) -> str:
@@ -425,8 +454,7 @@ def _ask_if_doubled(before: Workspace, work: Workspace, pointer: PointerContext)
     if refined <= MAX_REFINE_GROWTH * count:
         return work
     text = f"Refine would enlarge the selection from {group_digits(count)} to {group_digits(refined)} splats"
-    button = ("Enlarge", Plain("refine_anyway"))
-    return workspace.with_message(before, text, pointer.now, button=button)
+    return workspace.with_question(before, text, [("Enlarge", Plain("refine_anyway"))])
 
 
 UNDO_S = 2.0

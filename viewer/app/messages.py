@@ -16,7 +16,7 @@ from progdf import __version__
 from progdf.errors import ProgdfError, without_commands
 from progdf.io.atomic import state_folder
 from viewer.state.commands import Action
-from viewer.state.workspace import Dialog, Store, with_message
+from viewer.state.workspace import Dialog, Store, with_message, with_question
 
 LOG = "window.log"
 
@@ -39,6 +39,11 @@ class Messages:
         """Show one line at the bottom of the picture for a while, with a button (label and command)."""
         work = self._store.get()
         self._store.replace(with_message(work, text, self._clock(), error, details, button=button))
+        self._store.wake()
+
+    def offer(self, text: str, *buttons: tuple[str, Action], error: bool = False) -> None:
+        """Show one line below the axes with buttons (label and command), until one of them is pressed."""
+        self._store.replace(with_question(self._store.get(), text, buttons, error))
         self._store.wake()
 
     def ask(self, dialog: Dialog) -> None:

@@ -101,6 +101,10 @@ def perform(workspace: Workspace, action: Action, facts: SceneFacts, aspect: flo
         workspace = replace(workspace, player=replace(workspace.player, chosen=frozenset()))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
+    if name == "flip_up":
+        x, y, z = workspace.view.camera.up
+        flipped = replace(workspace.view.camera, up=(-x, -y, -z))
+        return replace(workspace, view=replace(workspace.view, camera=facts.home(flipped, aspect)))
     if name in ("paint_clear", "paint_fill", "paint_invert", "paint_feather"):
         return _repaint(workspace, name, facts)
     if name in selection.CHANGES:
@@ -540,6 +544,7 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     ),
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
     "look": _view_from,
+    "view_settings": lambda w, _: replace(w, settings_opening=True),
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "view_mode": _set_mode,

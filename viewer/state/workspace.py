@@ -88,6 +88,15 @@ class Message:
 
 
 @dataclass(frozen=True)
+class Question:
+    """One-line question below the axes of the picture, visible until it is answered or closed."""
+
+    text: str
+    buttons: tuple[tuple[str, Action], ...]  # label and command of each
+    error: bool = False
+
+
+@dataclass(frozen=True)
 class Dialog:
     """Open dialog."""
 
@@ -173,6 +182,8 @@ class Workspace:
     query: str = ""  # search text of the palette
     history: bool | None = None  # state of the history list: True when it opens, then False, None if closed
     message: Message | None = None  # line at the bottom of the picture
+    question: Question | None = None  # line below the axes
+    settings_opening: bool = False  # the view settings open in the next frame
     snapshots: tuple[SliderSnapshot, ...] = ()  # without the original
     # last saved state, see `saved_state`; None before `mark_saved`
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
@@ -281,8 +292,25 @@ def with_message(
         seconds = DETAILS_S
     elif error or button:
         seconds = ERROR_S
-    text = escape_text(" ".join(text.split()))
-    return replace(workspace, message=Message(text, now + seconds, error, details, button))
+    return replace(workspace, message=Message(_on_one_line(text), now + seconds, error, details, button))
+
+
+def with_question(
+    workspace: Workspace, text: str, buttons: Sequence[tuple[str, Action]], error: bool = False
+) -> Workspace:
+    """Show a one-line question with its buttons until it is answered. It replaces an earlier one.
+
+    Args:
+        workspace: the workspace
+        text: the question, put on one line and escaped
+        buttons: label and command of each
+        error: mark it as an error
+    """
+    return replace(workspace, question=Question(_on_one_line(text), tuple(buttons), error))
+
+
+def _on_one_line(text: str) -> str:
+    return escape_text(" ".join(text.split()))
 
 
 def record_undo(workspace: Workspace) -> Workspace:

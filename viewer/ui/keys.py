@@ -109,6 +109,8 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("navigate:fly", "Fly", "", "W A S D, Q E; right drag looks around"),
         Command("frame", "Frame", "F Num.", "The selection, the selected layer, or the scene"),
         Command("home", "Reset the view", "Shift+F Num0"),
+        Command("flip_up", "Flip the up axis", "", "Turn a scene that stands on its head"),
+        Command("view_settings", "View settings…", "", "Up axis, view angle, background, grid"),
         *_row("Numpad 1 3 7", "Front, right, top", _view_commands()),
         Command("grid", "Ground grid", "Shift+G", row="Ground grid; measure"),
         Command("measure", "Measure", "Shift+M", "Distance of two points; its true length", row=JOINED),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.view_camera import SHAPES, ViewCamera, axes, dot, widen
 from viewer.camera.views import AXES
+from viewer.state.commands import Action
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Message
+from viewer.state.workspace import Message, Question
 
 from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
 from .widgets import plate
@@ -104,26 +106,61 @@ def message(line: Message, area: Area, left: float, ui: UiContext) -> tuple[str,
     """
     pad = 12.0 * ui.scale
     left = max(left, pad)
+    buttons = {}
+    if line.details:
+        buttons["copy"] = "Copy details"
+    elif line.button is not None:
+        buttons["do"] = line.button[0]
     widest = min(area.width - left - pad, 640.0 * ui.scale)
-    imgui.set_next_window_size_constraints((0.0, 0.0), (widest, area.height))
-    with plate("message", (left, area.height - pad), ui, (0.0, 1.0), 12.0):
-        buttons = {}
-        if line.details:
-            buttons["Copy details"] = "copy"
-        elif line.button is not None:
-            buttons[line.button[0]] = "do"
-        buttons["×"] = "close"
+    at = (left, area.height - pad)
+    return _line("message", line.text, line.error, buttons, at, (0.0, 1.0), widest, ui)
+
+
+def question(line: Question, corner: tuple[float, float], room: float, ui: UiContext) -> Action | str | None:
+    """Draw a question with its buttons.
+
+    Args:
+        line: the question
+        corner: its upper right corner, window pixels
+        room: largest width, window pixels
+        ui: fonts and scale
+
+    Returns:
+        The command of the clicked button; "" if the question was closed, None if nothing was clicked.
+    """
+    labels = {label: label for label, _ in line.buttons}
+    widest = min(room, 420.0 * ui.scale)
+    clicked, _ = _line("question", line.text, line.error, labels, corner, (1.0, 0.0), widest, ui)
+    if clicked == "close":
+        return ""
+    return dict(line.buttons).get(clicked)
+
+
+def _line(
+    name: str,
+    text: str,
+    error: bool,
+    buttons: Mapping[str, str],
+    at: tuple[float, float],
+    pivot: tuple[float, float],
+    widest: float,
+    ui: UiContext,
+) -> tuple[str, float]:
+    """Draw a plate with a text and its buttons; return the clicked one and the plate's upper edge."""
+    pad = 12.0 * ui.scale
+    imgui.set_next_window_size_constraints((0.0, 0.0), (widest, imgui.get_io().display_size.y))
+    with plate(name, at, ui, pivot, 12.0):
+        labels = {**buttons, "close": "×"}
         around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
-        room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
-        wrap = imgui.calc_text_size(line.text).x > room
+        room = widest - 2 * pad - sum(imgui.calc_text_size(label).x + around for label in labels.values())
+        wrap = imgui.calc_text_size(text).x > room
         with imgui_ctx.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0):
             imgui.align_text_to_frame_padding()
-            color = PALETTE.error if line.error else PALETTE.text
-            imgui.text_colored(color, line.text)
+            imgui.text_colored(PALETTE.error if error else PALETTE.text, text)
         clicked = ""
-        for text, name in buttons.items():
+        for key, label in labels.items():
             imgui.same_line()
-            clicked = name if imgui.small_button(text) else clicked
+            clicked = key if imgui.small_button(label) else clicked
         top = imgui.get_window_pos().y
     return clicked, top
 

@@ -19,6 +19,7 @@ from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.camera.view_camera import axes, first_camera, with_up
 from viewer.files.document import load
 from viewer.state import selection
+from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.keys import Keys, Press
@@ -139,16 +140,17 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
     cloud = load(tmp_path / "cloud.ply")
     first = ViewState(camera=first_camera(cloud.scene, up=cloud.detected_up.direction))
     with null_app(cloud, first, tmp_path) as app:
-        message = lambda: app.main_view.work.message  # noqa: E731
+        question = lambda: app.main_view.work.question  # noqa: E731
         app._wait_times()
         app._wait_times()
-        line = message()
+        line = question()
         assert line is not None
-        assert line.text.startswith("Guessed −Y as up in cloud.ply")
-        app.main_view.store.replace(replace(app.main_view.work, message=None))
+        assert line.text == "Guessed −Y as up"
+        assert [label for label, _ in line.buttons] == ["Flip", "Choose…"]
         camera = with_up(app.main_view.work.view.camera, (0.0, 0.0, 1.0))
         app.main_view.store.change(replace(app.main_view.work.view, camera=camera))
         app._wait_times()
+        assert question() is None, "the new axis answers it"
         assert find_up(cloud.scene).name == "+z", "what is chosen in the popover is remembered"
         press(app, "Ctrl+Z")
         app._wait_times()
@@ -158,12 +160,18 @@ def test_guessed_up_axis_is_reported_until_the_user_sets_it(tmp_path: Path) -> N
         shutil.move(tmp_path / "cloud.ply", tmp_path / "other.ply")
         found = find_up(load(tmp_path / "other.ply").scene)
         assert (found.name, found.certain) == ("+z", True), "a training, which reads the file itself, agrees"
-        app.main_view.store.replace(replace(app.main_view.work, message=None))
         app.parts.file_actions.open(tmp_path / "other.ply")
         app._wait_times()
-        assert message() is None
+        assert question() is None
         assert app.main_view.work.view.camera.up == (0.0, 0.0, 1.0)
         save_ply(tmp_path / "cloud.ply", random_gaussians(50, scale=0.2))
         app.parts.file_actions.open(tmp_path / "cloud.ply")
         app._wait_times()
-        assert message() is not None
+        assert question() is not None
+        up = app.main_view.work.view.camera.up
+        app.main_view._perform(Plain("flip_up"))
+        app.main_view.wake()
+        app.draw()
+        app._wait_times()
+        assert app.main_view.work.view.camera.up == tuple(-c for c in up)
+        assert question() is None

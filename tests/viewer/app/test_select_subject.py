@@ -100,9 +100,9 @@ def test_refine_asks_before_it_doubles_a_selection(hand: Rig, monkeypatch: pytes
     smaller = selection.select(work.view.selection, few)
     hand.main_view.store.replace(replace(work, view=replace(work.view, selection=smaller)))
     hand.main_view._perform(Plain("select_refine"))
-    message = hand.main_view.work.message
+    question = hand.main_view.work.question
     assert (selected(hand) == few).all()
-    assert message is not None
-    assert message.button == ("Enlarge", Plain("refine_anyway"))
-    hand.main_view._perform(message.button[1])
+    assert question is not None
+    assert question.buttons == (("Enlarge", Plain("refine_anyway")),)
+    hand.main_view._perform(question.buttons[0][1])
     assert selected(hand).all()

@@ -683,10 +683,11 @@ def test_edit_of_another_scene_is_rebound_from_its_message(window: application.A
     save_gdf(foreign, replace(scarf, scene=fingerprint(moved)))
     save_ply(tmp_path / "moved.ply", moved)
     window.parts.file_actions.open(foreign)
-    message = window.main_view.work.message
-    assert message is not None
-    assert (message.text, message.button[0]) == ("foreign.gdf was made for another scene", "Rebind…")
-    request(window, message.button[1])
+    question = window.main_view.work.question
+    assert question is not None
+    label, action = question.buttons[0]
+    assert (question.text, label) == ("foreign.gdf was made for another scene", "Rebind…")
+    request(window, action)
     dialog = window.main_view.work.dialog
     assert dialog is not None
     window.main_view.messages.ask(replace(dialog, text=str(tmp_path / "moved.ply")))

@@ -18,10 +18,12 @@ from viewer.app.messages import Messages, Requests
 from viewer.camera.view_camera import Vec3
 from viewer.files.document import DocumentStore
 from viewer.state import selection
+from viewer.state.commands import Plain
 from viewer.state.workspace import Store
 from viewer.ui.keys import shortcut
 
 _POLL_S = 0.1
+_UP_BUTTONS = (("Flip", Plain("flip_up")), ("Choose…", Plain("view_settings")))
 
 
 class StrayActions:
@@ -122,10 +124,12 @@ class UpActions:
         if self._looked and up != before:
             up_axis.remember_chosen_up(document.scene, up)
         guess = not (self._looked or session or document.detected_up.certain)
-        if guess and up == document.detected_up.direction and self._store.get().message is None:
+        work = self._store.get()
+        if guess and up == document.detected_up.direction and work.question is None:
             name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
-            where = "Change it under the axes: Up axis."
-            self._messages.show(f"Guessed {name} as up in {document.title}. {where}")
+            self._messages.offer(f"Guessed {name} as up", *_UP_BUTTONS)
+        elif self._looked and up != before and work.question and work.question.buttons == _UP_BUTTONS:
+            self._store.replace(replace(work, question=None))  # the new axis answers it
         self._looked = True
 
     def leave_scene(self) -> None:
