@@ -303,15 +303,16 @@ def _draw_question(work: Workspace, pointer: PointerContext) -> Workspace:
     area = pointer.area
     edge = tools.EDGE_PX * ui.scale
     is_narrow = area.width < tools.NARROW_PX * ui.scale
-    above = [imgui.internal.find_window_by_name(name) for name in ("view", "options", "placing")]
-    shown = [window for window in above[: 3 if is_narrow else 1] if window is not None and window.was_active]
+    bars = ("view", "options", "placing", "comparison") if is_narrow else ("view",)
+    above = [imgui.internal.find_window_by_name(name) for name in bars]
+    shown = [window for window in above if window is not None and window.was_active]
     top = max((window.pos.y + window.size.y for window in shown), default=0.0) + edge
     room = area.width - tools.LEFT_PX * ui.scale - edge
-    pressed = overlay.question(question, (area.width - edge, top), room, ui)
-    if pressed is None:
+    answered, command = overlay.question(question, (area.width - edge, top), room, ui)
+    if not answered:
         return work
     work = replace(work, question=None)
-    return perform_actions(work, [pressed] if pressed else [], pointer)
+    return perform_actions(work, [] if command is None else [command], pointer)
 
 
 def _active_tool(work: Workspace) -> str:

@@ -116,7 +116,9 @@ def message(line: Message, area: Area, left: float, ui: UiContext) -> tuple[str,
     return _line("message", line.text, line.error, buttons, at, (0.0, 1.0), widest, ui)
 
 
-def question(line: Question, corner: tuple[float, float], room: float, ui: UiContext) -> Action | str | None:
+def question(
+    line: Question, corner: tuple[float, float], room: float, ui: UiContext
+) -> tuple[bool, Action | None]:
     """Draw a question with its buttons.
 
     Args:
@@ -126,14 +128,12 @@ def question(line: Question, corner: tuple[float, float], room: float, ui: UiCon
         ui: fonts and scale
 
     Returns:
-        The command of the clicked button; "" if the question was closed, None if nothing was clicked.
+        Whether it was answered or closed, and the command of the pressed button.
     """
     labels = {label: label for label, _ in line.buttons}
     widest = min(room, 420.0 * ui.scale)
     clicked, _ = _line("question", line.text, line.error, labels, corner, (1.0, 0.0), widest, ui)
-    if clicked == "close":
-        return ""
-    return dict(line.buttons).get(clicked)
+    return bool(clicked), dict(line.buttons).get(clicked)
 
 
 def _line(

@@ -100,7 +100,7 @@ def _sides(item: Box, around: Box, size: tuple[float, float], gap: float) -> tup
 def _lists() -> list[Box]:
     """Return the boxes of the window with the last item, and of the windows that opened it."""
     boxes = []
-    window = imgui.internal.get_current_window()
+    window: imgui.internal.Window | None = imgui.internal.get_current_window()
     while window is not None:
         root = window.root_window
         corner = root.pos
