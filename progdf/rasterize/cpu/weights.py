@@ -16,18 +16,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.rasterize.engines import TRANSMITTANCE_MIN
-
-from .blend import ALPHA_LIMIT, EIGHT, LOG2_ALPHA_MIN, ONE, ZERO, TileScratch, tile_corner
+from .blend import (
+    ALPHA_LIMIT,
+    BATCH,
+    EIGHT,
+    END,
+    FIRST,
+    ONE,
+    SPLAT,
+    STEP,
+    TRANSMITTANCE_LIMIT,
+    ZERO,
+    TileScratch,
+    exp2,
+    find_spans,
+    row_span,
+    tile_bounds,
+    tile_corner,
+)
 from .forward import (
-    EXTENT_Y,
-    INV_L11,
-    L11,
-    L22,
-    MX,
-    MY,
-    R2,
-    SLOPE,
     TILE_H,
     TILE_W,
     Pinhole,
@@ -44,8 +51,9 @@ WEIGHT_STEPS = 65535
 _PLANE = TILE_W * TILE_H + WIDTH  # pixels of a tile, and room for the surplus of the last group of eight
 _G = np.uint64(_PLANE)  # start of the plane of the second channel
 _B = np.uint64(2 * _PLANE)
-_LOG2_ALPHA_MIN: Number = np.float32(LOG2_ALPHA_MIN)
-_TRANSMITTANCE_LIMIT: Number = np.float32(TRANSMITTANCE_MIN)
+# Planes of a tile: transmittance (negative: the pixel is done), weight that may still be omitted, weights of
+# the current splat, and index of the pixel in its row of the list.
+_SPARE, _WEIGHT, _PIXEL = (np.uint64(k * _PLANE) for k in (1, 2, 3))
 
 
 class Spans(NamedTuple):
@@ -144,83 +152,123 @@ def join_spans(parts: list[Spans]) -> Spans:
     return Spans(*joined)
 
 
-@kernel(contract=True, inline=True)
+@kernel(fast=True, inline=True)
+def _pass_row(state: Array, batch: Array, splat: Number, row: Number, is_listed: Number) -> None:
+    """Pass one row of a splat through a tile's state, and put the weights to list into its plane.
+
+    splat: start of its spans in `batch`
+    """
+    start, stop, p, u_peak, top = row_span(batch, splat, row)
+    step = batch[splat + STEP]
+    offset = start + lane_indices()
+    while start < stop:
+        u = u_peak + step * offset
+        alpha = exp2(top - u * u)
+        alpha = select(alpha < ALPHA_LIMIT, alpha, ALPHA_LIMIT)
+        before = load(state, p)
+        spare = load(state, p + _SPARE)
+        after = before * (ONE - alpha)
+        # a pixel is done if its remaining weight may be omitted
+        is_open = (offset < stop) & (spare < before)
+        taken = is_open & (after > TRANSMITTANCE_LIMIT)
+        store(state, p, select(taken, after, select(is_open, ZERO - before, before)))
+        if is_listed:
+            weight = select(taken, alpha * before, ZERO)
+            # omit a weight of at most an eighth of the remaining allowance
+            is_kept = spare < EIGHT * weight
+            store(state, p + _WEIGHT, select(is_kept, weight, ZERO))
+            store(state, p + _SPARE, select(is_kept, spare, spare - weight))
+        p += np.uint64(WIDTH)
+        offset += EIGHT
+        start += EIGHT
+
+
+@kernel(inline=True)
+def _list_row(
+    state: Array, batch: Array, splat: Number, line: int, row: int, span: int, entry: int, out: Spans
+) -> tuple[int, int]:
+    """Write the weights of one row, as far as there is room. row: Gaussian, see `Spans`
+
+    Returns:
+        `span` and `entry` after this row, including those without room.
+    """
+    start, stop, p, _, _ = row_span(batch, splat, np.uint64(line))
+    origin = entry  # entry of the span's first weight
+    place = 0  # pixel of that weight
+    for at in range(p, p + np.uint64(max(stop - start, ZERO))):
+        weight = state[at + _WEIGHT]
+        if weight == ZERO:
+            continue
+        pixel = int(state[at + _PIXEL])
+        place = pixel if entry == origin else place
+        while entry < origin + pixel - place:  # a gap of omitted weights
+            if entry < out.weights.size:
+                out.weights[entry] = ZERO
+            entry += 1
+        if entry < out.weights.size:
+            out.weights[entry] = weight
+        entry += 1
+    for begin in range(origin, entry, WIDTH):
+        if span < out.places.size:
+            out.rows[span] = row
+            out.places[span] = line * TILE_W + place + begin - origin
+            out.lengths[span] = min(WIDTH, entry - begin)
+        span += 1
+    return span, entry
+
+
+@kernel(fast=True, inline=True)
+def _is_open(state: Array) -> Number:
+    """Return true if some pixel of a tile may get further weights."""
+    most = -ONE
+    for p in range(np.uint64(TILE_H * TILE_W)):
+        most = max(most, state[p] - state[p + _SPARE])
+    return most > ZERO
+
+
+@kernel(contract=True)
 def _list_tile(
-    tile: int, number: int, splats: Splats, listed: ListSelection, camera: Pinhole, members: Array,
-    state: Array, span: int, entry: int, out: Spans,
+    tile: int, number: int, scratch: TileScratch, splats: Splats, listed: ListSelection, camera: Pinhole,
+    members: Array, span: int, entry: int, out: Spans,
 ) -> tuple[int, int]:  # fmt: skip
     """Write one tile's spans and weights, as far as there is room. number: row of the tile in `out`
 
     Returns:
         `span` and `entry` after this tile, including those without room.
     """
+    state, batch, bounds = scratch
     x, y = tile_corner(camera, tile)
-    left = max(0, camera.window[0] - x)
-    right = min(TILE_W, camera.window[2] - x)
-    top = max(0, camera.window[1] - y)
-    bottom = min(TILE_H, camera.window[3] - y)
+    tile_bounds(camera, x, y, bounds)
     width = camera.window[2] - camera.window[0]
     corner = (y - camera.window[1]) * width + x - camera.window[0]
-    through = state[: TILE_H * TILE_W]
-    spare = state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
-    through[:], spare[:] = ZERO, listed.lost  # spare: weight that may still be omitted
+    state[:_PLANE] = ZERO  # transmittance, 0 in pixels that are not listed
+    state[_PLANE : 2 * _PLANE] = listed.lost
     out.firsts[number], out.widths[number] = 0, 0
-    for i in range(top, bottom):
-        for j in range(left, right):
+    for i in range(bounds[1], bounds[3]):
+        for j in range(bounds[0], bounds[2]):
             pixel = listed.places[corner + i * width + j]
-            through[i * TILE_W + j] = ONE if pixel >= 0 else ZERO
             if pixel >= 0:
                 if out.widths[number, i] == 0:
                     out.firsts[number, i] = pixel
+                at = np.uint64(i * TILE_W + j)
+                state[at] = ONE
+                state[at + _PIXEL] = np.float32(out.widths[number, i])
                 out.widths[number, i] += 1
-    for s in members:
-        shape = splats.shapes[s]
-        mx = shape[MX] - x - 0.5
-        my = shape[MY] - y - 0.5
-        first = max(math.ceil(my - shape[EXTENT_Y]), top)
-        end = min(math.floor(my + shape[EXTENT_Y]) + 1, bottom)
-        for i in range(first, end):
-            v = shape[L22] * (i - my)
-            remaining = shape[R2] - v * v
-            if remaining < 0.0:
-                continue
-            center = mx - shape[SLOPE] * (i - my)
-            half = math.sqrt(remaining) * shape[INV_L11]
-            start = max(math.ceil(center - half), left)
-            stop = min(math.floor(center + half) + 1, right)
-            origin = entry  # entry of the span's first weight
-            place = 0  # pixel of that weight
-            for j in range(start, stop):
-                before = through[i * TILE_W + j]
-                # the pixel is done, or the remaining weight may be omitted
-                if before <= spare[i * TILE_W + j]:
-                    continue
-                u = shape[L11] * (j - center)
-                alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), ALPHA_LIMIT)
-                after = before * (ONE - alpha)
-                if after <= _TRANSMITTANCE_LIMIT:
-                    through[i * TILE_W + j] = -before
-                    continue
-                through[i * TILE_W + j] = after
-                if listed.rows[s] >= 0 and EIGHT * alpha * before <= spare[i * TILE_W + j]:
-                    # the weight is at most an eighth of the remaining allowance
-                    spare[i * TILE_W + j] -= alpha * before
-                elif listed.rows[s] >= 0:
-                    pixel = listed.places[corner + i * width + j] - out.firsts[number, i]
-                    place = pixel if entry == origin else place
-                    while entry < origin + pixel - place:  # a gap of omitted weights
-                        if entry < out.weights.size:
-                            out.weights[entry] = ZERO
-                        entry += 1
-                    if entry < out.weights.size:
-                        out.weights[entry] = alpha * before
-                    entry += 1
-            for begin in range(origin, entry, WIDTH):
-                if span < out.places.size:
-                    out.rows[span] = listed.rows[s]
-                    out.places[span] = i * TILE_W + place + begin - origin
-                    out.lengths[span] = min(WIDTH, entry - begin)
-                span += 1
+    count = members.size
+    while count > 0 and listed.rows[members[count - 1]] < 0:  # nothing to list behind the last listed one
+        count -= 1
+    for begin in range(0, count, BATCH):
+        end = min(begin + BATCH, count)
+        find_spans(members, begin, end, splats, x, y, bounds, batch)
+        for index in range(begin, end):
+            splat = np.uint64(index - begin) * SPLAT
+            row = listed.rows[members[index]]
+            for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
+                _pass_row(state, batch, splat, np.uint64(line), row >= 0)
+                if row >= 0:
+                    span, entry = _list_row(state, batch, splat, line, row, span, entry, out)
+        if not _is_open(state):
+            break
     return span, entry
 
 
@@ -238,9 +286,7 @@ def list_weights(
     for tile in range(begin, end):
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         before = span
-        span, entry = _list_tile(
-            tile, tile - begin, splats, listed, camera, own, scratch.state, span, entry, out
-        )
+        span, entry = _list_tile(tile, tile - begin, scratch, splats, listed, camera, own, span, entry, out)
         out.tiles[tile - begin] = span - before
     return span, entry
 
