@@ -18,16 +18,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from progdf.camera import Camera
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MAX_COLOR, member_bands, monomials
-from progdf.gaussians import attribute_slices
+from progdf.gaussians import Gaussians, attribute_slices
 from progdf.metrics.image import ROUNDING
-from progdf.rasterize.cpu.engine import Array
+from progdf.rasterize import activate
+from progdf.rasterize.cpu.engine import Array, rasterize_listed
 from progdf.rasterize.cpu.jit import Number, kernel
-from progdf.rasterize.engines import ColorMap, color_map
+from progdf.rasterize.engines import ColorMap, RasterView, color_map
 from progdf.sh import C0, basis
 from progdf.threads import one_thread
 from trainer.views.crops import CropScene
+from trainer.views.view import View
 
 from . import color_tensors
 from .color_kernels import drop_held, keep_drawn, shade_views
@@ -250,16 +253,21 @@ def view_blocks(views: Sequence[_A]) -> list[Sequence[_A]]:
     return [views[begin : begin + _VIEW_BATCH] for begin in range(0, len(views), _VIEW_BATCH)]
 
 
-def color_view(crop: CropScene, members: ColorMembers, every: int, index: int) -> ColorView:
-    """Return the `index`th of `color_views`."""
-    camera = crop.camera
-    height, width = crop.size
+def _chosen_pixels(size: tuple[int, int], every: int, index: int) -> Tensor:
+    """Return the pixels of a box that the `index`th view uses, see `color_views`. [P] int64"""
+    height, width = size
     place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
-    pixels = (place % every == 0).flatten().nonzero()[:, 0].to(members.means.device)
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, OMITTED_WEIGHT)
-    original = crop.original.flatten(0, 1)[pixels]
+    return (place % every == 0).flatten().nonzero()[:, 0]
+
+
+def _color_view(
+    weighed: ColorMap, image: Tensor, pixels: Tensor, members: ColorMembers, camera: Camera
+) -> ColorView:
+    """Return the view of a box. image: the original, not clamped. [h,w,3]"""
+    height, width, _ = image.shape
+    original = image.flatten(0, 1)[pixels]
     counts = torch.ones_like(original[:, :1], dtype=torch.bool)
-    view = ColorView(weighed, original, members, camera.position, crop.size, pixels, counts)
+    view = ColorView(weighed, original, members, camera.position, (height, width), pixels, counts)
     return replace(view, others=original - weighed.picture(view.original.clamp_min(0.0)))
 
 
@@ -273,7 +281,42 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
     """
     members = ColorMembers.of(original)
     device = original.device
-    return map_views(lambda i: color_view(crops[i], members, every, i), range(len(crops)), device)
+
+    def draw(index: int) -> ColorView:
+        crop = crops[index]
+        pixels = _chosen_pixels(crop.size, every, index).to(device)
+        weighed = color_map(
+            crop.gaussians, crop.camera, crop.box, crop.rows, crop.engine, pixels, OMITTED_WEIGHT
+        )
+        return _color_view(weighed, crop.original, pixels, members, crop.camera)
+
+    return map_views(draw, range(len(crops)), device)
+
+
+def draw_color_views(
+    scene: Gaussians, rows: Tensor, views: Sequence[View], background: Tensor, original: Tensor, every: int
+) -> list[ColorView]:
+    """Return the same views as `color_views` for the CPU, with one projection per view and no crops.
+
+    Args:
+        scene: the original
+        rows: rows of the region. [M] int64
+        views: views whose boxes are drawn
+        background: rgb. [3]
+        original, every: see `color_views`
+    """
+    members = ColorMembers.of(original)
+    gaussians = activate(scene)
+
+    def draw(index: int) -> ColorView:
+        camera = views[index].camera
+        window = RasterView.of(camera, gaussians, views[index].box)
+        x0, y0, x1, y1 = window.crop
+        pixels = _chosen_pixels((y1 - y0, x1 - x0), every, index)
+        image, weighed = rasterize_listed(gaussians, window, background, rows, pixels, OMITTED_WEIGHT)
+        return _color_view(weighed, image, pixels, members, camera)
+
+    return map_views(draw, range(len(views)), original.device)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, anchor_added, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, to_json
+from progdf.rasterize import activate
 from progdf.terminal import file_size, format_count
 from progdf.threads import map_threads
 from trainer.fit.evaluate import Evaluator, make_evaluator
@@ -308,10 +309,11 @@ def _fit_field(
 
 def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
     """Render and write the views of the finished edit."""
+    gaussians = activate(edited)
     with log.looks("picture the edit", len(setup.views)) as count_view:
 
         def draw(view: View) -> tuple[str, Tensor]:
-            picture = render_view(edited, view.camera, setup.background)
+            picture = render_view(gaussians, view.camera, setup.background)
             count_view()
             return view.camera.name, picture
 

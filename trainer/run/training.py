@@ -34,7 +34,13 @@ from trainer.optimize.color_solver import (
     solve_again,
     split_solver,
 )
-from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorEvaluator, ColorView, color_views
+from trainer.optimize.color_views import (
+    MAX_ERROR_SHARE,
+    ColorEvaluator,
+    ColorView,
+    color_views,
+    draw_color_views,
+)
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Perceptual, loss_table
@@ -292,6 +298,8 @@ def plan_colors(
     judging = held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
+        if engine == "cpu":
+            return draw_color_views(scene, members, views, setup.background, original, stride)
         make = partial(crop_scene, scene, members, background=setup.background, engine=engine)
         return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, stride)
 

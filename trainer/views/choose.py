@@ -32,7 +32,7 @@ from progdf.scene.up_axis import find_up
 from progdf.threads import map_threads
 from trainer.options import TrainingViewOptions
 
-from .view import View, fit_size, make_view
+from .view import View, fit_size, make_views
 
 T = TypeVar("T")
 
@@ -148,7 +148,7 @@ class CameraChoice:
 
     def views(self, scene: Gaussians, region: Region, background: Tensor) -> ViewChoice:
         """Render the views. background: rgb. [3]"""
-        views = map_threads(lambda camera: make_view(scene, region, camera, background), self.cameras)
+        views = make_views(scene, region, self.cameras, background)
         return ViewChoice(tuple(views), self.shown, self.offered, self.unseeing, self.scant)
 
 

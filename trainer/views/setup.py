@@ -19,7 +19,6 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import ELEVATIONS, HALF_SPHERE
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
-from progdf.threads import map_threads
 from trainer.options import COLOR_VIEWS, VIEWS, TrainingViewOptions
 
 from .choose import (
@@ -40,7 +39,7 @@ from .view import (
     View,
     fit_size,
     make_glances,
-    make_view,
+    make_views,
     name_cameras,
     region_rig,
     with_near_plane,
@@ -251,7 +250,7 @@ def _rig_views(
     # a rig at free places may have fewer cameras than requested
     places = sorted({i * len(between) // len(cameras) for i in successors}) if between else []
     others = [replace(between[i], name=f"between_{i:03d}") for i in places]
-    views = map_threads(lambda camera: make_view(scene, region, camera, background), others)
+    views = make_views(scene, region, others, background)
     held_out = [view for view in views if bool((view.mask > 0.0).any())]
     return choice, *((train, held_out) if held_out else split_views(choice, aside))
 
@@ -271,7 +270,7 @@ def _picture_setup(
     size = options.image_size or PICTURE_SIZE
     cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
     cameras = with_near_plane(name_cameras(cameras), scene)
-    views = [make_view(scene, region, camera, background) for camera in cameras]
+    views = make_views(scene, region, cameras, background)
     for view, path in zip(views, options.pictures, strict=True):
         if not bool((view.mask > 0).any()):
             raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")

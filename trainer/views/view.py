@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.io.picture_files import name_twin, view_name
-from progdf.rasterize import Crop, activate, render
+from progdf.rasterize import ActivatedGaussians, Crop, activate, render
 from progdf.rasterize.cpu.engine import rasterize_part
 from progdf.rasterize.engines import ColorMap, RasterView, color_map
 from progdf.region import Region
@@ -126,12 +126,21 @@ def continue_colors(colors: Tensor, weights: Tensor) -> Tensor:
 
 def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:
     """Render the original view and the region's share of it."""
+    return make_views(scene, region, [camera], background)[0]
+
+
+def make_views(scene: Gaussians, region: Region, cameras: Sequence[Camera], background: Tensor) -> list[View]:
+    """Render the original views and the region's share of them. background: rgb. [3]"""
     gaussians = activate(scene)
-    view = RasterView.of(camera, gaussians)
-    image, share, part = rasterize_part(gaussians, view, background, region.members)
-    mask = share.clamp(0.0, 1.0)
-    inside = (part / mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0)
-    return View(camera, image.clamp(0.0, 1.0), mask, inside, region_box(mask))
+
+    def draw(camera: Camera) -> View:
+        view = RasterView.of(camera, gaussians)
+        image, share, part = rasterize_part(gaussians, view, background, region.members)
+        mask = share.clamp_(0.0, 1.0)
+        inside = part.div_(mask.clamp_min(1e-4)[..., None]).clamp_(0.0, 1.0)
+        return View(camera, image.clamp_(0.0, 1.0), mask, inside, region_box(mask))
+
+    return map_threads(draw, cameras)
 
 
 def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
@@ -148,9 +157,10 @@ def render_colors(
         return render(scene, camera, background, colors=colors, crop=crop).image
 
 
-def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
+def render_view(scene: Gaussians | ActivatedGaussians, camera: Camera, background: Tensor) -> Tensor:
     """Render the scene, without gradients. [H,W,3]"""
-    return render_colors(scene, seen_colors(scene, camera), camera, background)
+    with torch.no_grad():
+        return render(scene, camera, background).image
 
 
 def on_backgrounds(scene: Gaussians, camera: Camera) -> list[Tensor]:

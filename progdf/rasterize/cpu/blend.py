@@ -114,8 +114,8 @@ class TileScratch(NamedTuple):
 
 
 def new_scratch() -> TileScratch:
-    """Allocate six planes and a batch."""
-    state = np.empty(6 * int(PLANE), np.float32)
+    """Allocate eight planes and a batch."""
+    state = np.empty(8 * int(PLANE), np.float32)
     batch = np.empty(BATCH * int(SPLAT), np.float32)
     return TileScratch(state, batch, np.empty(4, np.int64))
 
@@ -255,7 +255,7 @@ def _blend_row(
 
 
 @kernel(fast=True, inline=True)
-def _skip_done_rows(state: Array, bounds: Array) -> Number:
+def skip_done_rows(state: Array, bounds: Array) -> Number:
     """Remove finished rows from the top and bottom of `bounds`. Return true if any row is left."""
     while bounds[1] < bounds[3] and _is_done(state, bounds[1], bounds):
         bounds[1] += 1
@@ -292,7 +292,7 @@ def _blend_tile(
             splat = np.uint64(index - begin) * SPLAT
             for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
                 _blend_row(state, batch, splat, np.uint64(line), np.float32(index), last)
-        if not _skip_done_rows(state, bounds):
+        if not skip_done_rows(state, bounds):
             break
 
 

@@ -48,6 +48,7 @@ from .forward import (
     project,
 )  # fmt: skip
 from .jit import kernel
+from .parts import PartBuffers, blend_part
 from .weights import ListedWeights, ListSelection, Spans, join_spans, list_weights, new_spans, take_spans
 
 Array = NDArray[Any]
@@ -92,21 +93,29 @@ def rasterize_part(
     """
     camera = make_pinhole(view)
     splats, lists = _project_scene(gaussians, camera)
-
-    def draw(behind: Array) -> Array:
-        out = _new_picture(camera, with_last=False)
-        share_tiles(blend, camera, splats, lists, camera, behind, out, out.last)
-        return out.image
-
-    image = draw(to_float32(background).numpy())
-    black = np.zeros(3, np.float32)
+    x0, y0, x1, y1 = camera.window
+    image, share, part = (np.empty((y1 - y0, x1 - x0, *rest), np.float32) for rest in ((3,), (), (3,)))
     is_part = np.zeros(len(gaussians.means), np.bool_)
     is_part[rows.numpy()] = True
-    splats.colors[~is_part, :3] = 0.0
-    part = draw(black)
-    splats.colors[is_part, :3] = 1.0
-    share = draw(black)[..., 0]
+    out = PartBuffers(image, share, part)
+    share_tiles(blend_part, camera, splats, lists, camera, to_float32(background).numpy(), is_part, out)
     return torch.from_numpy(image), torch.from_numpy(share), torch.from_numpy(part)
+
+
+def rasterize_listed(
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, rows: Tensor, pixels: Tensor,
+    lost: float,
+) -> tuple[Tensor, ListedWeights]:  # fmt: skip
+    """Draw a view, without gradients, and list the weights of some Gaussians in it, after one projection.
+
+    Returns:
+        The image, with the bits of `rasterize`; and the map, see `progdf.rasterize.engines.color_map`.
+    """
+    camera = make_pinhole(view)
+    splats, lists = _project_scene(gaussians, camera)
+    out = _new_picture(camera, with_last=False)
+    share_tiles(blend, camera, splats, lists, camera, to_float32(background).numpy(), out, out.last)
+    return torch.from_numpy(out.image), _list_view(splats, lists, camera, rows, pixels, lost)
 
 
 def draw_tiles(
@@ -315,15 +324,22 @@ def color_map(
 ) -> ListedWeights:
     """Return a color map, see `progdf.rasterize.engines.color_map`."""
     pinhole = make_pinhole(view)
-    x0, y0, x1, y1 = view.crop
+    splats, lists = bin_view(gaussians, pinhole)
+    return _list_view(splats, lists, pinhole, rows, pixels, lost)
+
+
+def _list_view(
+    splats: Splats, lists: TileLists, pinhole: Pinhole, rows: Tensor, pixels: Tensor | None, lost: float
+) -> ListedWeights:
+    """Return the color map of a projected view, see `progdf.rasterize.engines.color_map`."""
+    x0, y0, x1, y1 = pinhole.window
     window = (y1 - y0) * (x1 - x0)
     chosen = np.arange(window) if pixels is None else pixels.numpy()
     positions = np.full(window, -1, np.int32)
     positions[chosen] = np.arange(len(chosen), dtype=np.int32)
-    row_of = np.full(len(gaussians.means), -1, np.int32)
+    row_of = np.full(len(splats.visible), -1, np.int32)
     row_of[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     listed = ListSelection(row_of, positions, np.float32(lost))
-    splats, lists = bin_view(gaussians, pinhole)
 
     def list_tiles(begin: int, end: int) -> Spans:
         pairs = int(lists.starts[end] - lists.starts[begin])

@@ -16,6 +16,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import LEVEL
 from progdf.rasterize import activate, alpha_weights, render, set_threads
 from progdf.rasterize.engines import color_map
+from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from progdf.threads import map_threads
 from tests.helpers.scenes import random_gaussians
@@ -27,10 +28,11 @@ from trainer.optimize.color_solver import (
     choose_model,
     make_solver,
 )
-from trainer.optimize.color_views import ColorEvaluator, color_views
+from trainer.optimize.color_views import ColorEvaluator, color_views, draw_color_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.quality import BALANCED
 from trainer.views.crops import CropScene, crop_scene, render_all
+from trainer.views.view import make_view
 
 WHITE = torch.ones(3)
 
@@ -145,6 +147,24 @@ def test_solving_on_a_pixel_subset_is_as_good() -> None:
     stages = [TargetStage(1.0, targets, 1)]
     offsets = solve_all(solver, model, stages, PgsState(original), 40)[-1].offsets
     assert psnr(scene, edited, offsets, cameras) > 45.0
+
+
+def test_views_drawn_at_once_equal_views_of_crops() -> None:
+    """A region with Gaussians in front of and behind it, in a box smaller than the picture."""
+    scene = random_gaussians(800, seed=3, sh_degree=2)
+    members = torch.arange(5, 800, 3)
+    region = Region("part", members, torch.ones(800))
+    cameras = orbit(2, 64)
+    box = (7, 3, 60, 49)
+    crops = [crop_scene(scene, members, camera, box, WHITE) for camera in cameras]
+    views = [replace(make_view(scene, region, c, WHITE), box=box) for c in cameras]
+    original = pack(scene[members], with_shN=True)
+    drawn = draw_color_views(scene, members, views, WHITE, original, 2)
+    for view, plain in zip(drawn, color_views(crops, original, 2), strict=True):
+        assert view.size == plain.size
+        assert torch.equal(view.pixels, plain.pixels)
+        torch.testing.assert_close(view.share, plain.share, atol=2e-5, rtol=0)
+        torch.testing.assert_close(view.others, plain.others, atol=2e-5, rtol=0)
 
 
 def test_subpixel_members_learn_their_color() -> None:
