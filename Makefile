@@ -8,9 +8,9 @@ APT    := $(if $(shell command -v apt-get),apt,none)
 # that wait let the other workers have the core, and what they import is kept compiled for their children.
 PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest -n auto --dist worksteal
 
-EXTRAS := styles,diffusion,api,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes
+EXTRAS := styles,diffusion,api,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes,docs
 
-.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples
+.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples site
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -88,6 +88,11 @@ pictures: setup extras window browser
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/python assets/figures.py
 	$(BIN)/python assets/architecture.py
+
+# The site with the gallery and the reference of the Python interface; open build/site/index.html.
+site: setup extras
+	$(BIN)/python docs/site/gallery.py build/gallery
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build -q
 
 # What the start page opens with, and the wheel holds: trained anew in some minutes.
 examples: setup

@@ -145,7 +145,8 @@ class Widget(anywidget.AnyWidget):
         """Render the current strengths and camera with the CPU engine.
 
         Args:
-            width, height: size of the image, 1 to `LARGEST_SIDE` px
+            width: columns of the image, 1 to `LARGEST_SIDE`
+            height: rows of the image, 1 to `LARGEST_SIDE`
 
         Raises:
             ProgdfError: a side is out of range.
@@ -169,7 +170,9 @@ class Widget(anywidget.AnyWidget):
 
         Args:
             path: output file (.html)
-            title, credit, quality: see `PageOptions`
+            title: text above the sliders, "" for the scene's name
+            credit: author and license of the scene, below the sliders; addresses become links
+            quality: "exact" for float32; "compact" for 8 and 16 bits, at a third of the size
 
         Returns:
             One line that describes the contents of the page.

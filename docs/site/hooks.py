@@ -1,0 +1,70 @@
+"""Hooks of the site: pages that lie outside docs/, and links that lead there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+
+PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "SECURITY.md": "security.md"}
+"""Page of the repository → its name in the site."""
+
+GALLERY = ROOT / "build" / "gallery"
+"""Exported pages, their pictures and the page that lists them, made by `docs/site/gallery.py`."""
+
+_CODE_LINK = re.compile(r"\[([^\]\[]*)\]\([^)]+\.(?:py|ipynb)\)|\[([^\]\[]*)\]\(LICENSE\)")
+_LINK = re.compile(r"(\]\(|src=\"|href=\")([^)\"#\s]+)")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages of the repository, the pictures of assets/ and the gallery to those of docs/."""
+    from mkdocs.structure.files import File  # of the extra `docs`
+
+    for source, name in PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        files.append(File.generated(config, name, content=text))
+    for picture in sorted((ROOT / "assets").rglob("*")):
+        if picture.suffix in (".png", ".jpg", ".webp", ".svg"):
+            name = picture.relative_to(ROOT).as_posix()
+            files.append(File.generated(config, name, abs_src_path=str(picture)))
+    for made in sorted(GALLERY.glob("*")):
+        name = made.name if made.suffix == ".md" else f"gallery/{made.name}"
+        files.append(File.generated(config, name, abs_src_path=str(made)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Lead links of the repository to pages of the site, and unlink those to code."""
+    source = page.file.src_uri
+    folder = "" if source in PAGES.values() else "docs/"
+    folder += source.rpartition("/")[0]
+
+    def convert(match: re.Match[str]) -> str:
+        before, target = match.groups()
+        if re.match(r"[a-z]+:", target):
+            return match.group(0)
+        return before + site_link(source, folder, target)
+
+    linked = _CODE_LINK.sub(lambda match: match.group(1) or match.group(2), markdown)
+    return _LINK.sub(convert, linked)
+
+
+def site_link(source: str, folder: str, target: str) -> str:
+    """Return a relative link inside the site.
+
+    Args:
+        source: page of the site that holds the link
+        folder: folder of the repository from which the link is written, "" for its root
+        target: the link as written, without its anchor
+    """
+    parts = [part for part in folder.split("/") if part]
+    for part in target.split("/"):
+        if part == "..":
+            del parts[-1:]
+        else:
+            parts.append(part)
+    path = "/".join(parts)
+    path = PAGES.get(path, path.removeprefix("docs/"))
+    return "../" * source.count("/") + path

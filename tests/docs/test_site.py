@@ -1,0 +1,63 @@
+"""Tests of the site: its navigation, its links, and a strict build."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def load_script(name: str) -> ModuleType:
+    """Import a script of docs/site/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / "site" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    listed = re.findall(r": ([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    docs = ROOT / "docs"
+    pages = {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
+    generated = {*load_script("hooks").PAGES.values(), "gallery.md"}
+    assert set(listed) == {page for page in pages if not page.startswith("workflows/")} | generated
+    assert len(listed) == len(set(listed))
+
+
+@pytest.mark.parametrize(
+    ("source", "folder", "target", "link"),
+    [
+        ("index.md", "", "docs/cli.md", "cli.md"),
+        ("index.md", "", "assets/hero.webp", "assets/hero.webp"),
+        ("viewer.md", "docs/", "../assets/tour/paint.png", "assets/tour/paint.png"),
+        ("viewer.md", "docs/", "../README.md", "index.md"),
+        ("lab/regret.md", "docs/lab", "../benchmarks.md", "../benchmarks.md"),
+        ("lab/selection.md", "docs/lab", "../../assets/subject.png", "../assets/subject.png"),
+    ],
+)
+def test_links_lead_to_pages_of_the_site(source: str, folder: str, target: str, link: str) -> None:
+    assert load_script("hooks").site_link(source, folder, target) == link
+
+
+@pytest.mark.slow
+def test_site_builds_without_a_warning(tmp_path: Path) -> None:
+    """Every link, anchor and docstring resolves; each page of the gallery is at most 4 MB."""
+    pytest.importorskip("mkdocs")
+    subprocess.run([sys.executable, ROOT / "docs/site/gallery.py", ROOT / "build/gallery"], check=True)
+    command = [sys.executable, "-P", "-m", "mkdocs", "build", "-q", "-d", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    assert (tmp_path / "site" / "index.html").is_file()
+    exhibits = sorted((tmp_path / "site" / "gallery").glob("*.html"))
+    assert len(exhibits) >= 3
+    assert max(page.stat().st_size for page in exhibits) <= 4e6
