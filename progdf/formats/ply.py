@@ -28,7 +28,7 @@ from progdf.io.file_rules import PLAIN_GAUSSIANS, check_fields, unsupported_erro
 from progdf.quaternions import normalize_quats
 from progdf.sh import map_colors, rgb_to_sh0
 
-from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header
+from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header, row_blocks
 from .ply_view import CAMERA_ELEMENTS, check_frames, has_linear_colors, read_view
 from .repair import LoadReport, repair
 
@@ -299,7 +299,6 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
     If all columns are float32, each block is viewed as a matrix; otherwise the needed columns are stacked.
     """
     names = rows.dtype.names or ()
-    rows = np.asarray(rows)
     is_plain = all(rows.dtype[name] == np.dtype("<f4") for name in names)
     if not is_plain:
         names = tuple(name for part in columns.values() for name in part)
@@ -309,8 +308,7 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
     }
     bands = len(columns["shN"]) // 3
     arrays["shN"] = arrays["shN"].reshape(len(rows), bands, 3)
-    for first in range(0, len(rows), _BLOCK_ROWS):
-        block = rows[first : first + _BLOCK_ROWS]
+    for first, block in row_blocks(rows, _BLOCK_ROWS):
         if is_plain:
             table: Floats = block.view("<f4").reshape(len(block), -1)
         else:

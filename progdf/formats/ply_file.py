@@ -9,9 +9,10 @@ import io
 import itertools
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -136,7 +137,7 @@ class _Stream(io.FileIO):
     """Stream for plyfile: a header with the first elements only, then the data of the file."""
 
     def __init__(self, ply: PlyFile, elements: int) -> None:
-        super().__init__(ply.path)
+        super().__init__(os.fspath(ply.path))  # a text, so that numpy keeps it as the name of the mapped file
         self.seek(ply.length)
         starts = [i for i, line in enumerate(ply.header) if line.startswith("element")]
         head = ply.header[: (*starts, None)[elements]]
@@ -144,6 +145,31 @@ class _Stream(io.FileIO):
 
     def read(self, size: int | None = -1) -> bytes:
         return self._head.read(size) or super().read(size)
+
+
+def row_blocks(rows: npt.NDArray[np.void], count: int) -> Iterator[tuple[int, npt.NDArray[np.void]]]:
+    """Yield the first index and the values of successive blocks of `PlyFile.rows`.
+
+    Memory-mapped rows are read from their file into one buffer. Pages of the mapping would count as memory of
+    the process until the end, and would double the memory of a large scene while it is loaded.
+
+    Args:
+        rows: rows of an element. [N]
+        count: rows of a block. A block is valid until the next one is requested
+    """
+    if not isinstance(rows, np.memmap) or rows.filename is None:
+        for first in range(0, len(rows), count):
+            yield first, rows[first : first + count]
+        return
+    buffer: npt.NDArray[Any] = np.empty(min(count, len(rows)), rows.dtype)
+    with open(rows.filename, "rb", buffering=0) as file:
+        file.seek(rows.offset)
+        for first in range(0, len(rows), count):
+            block = buffer[: len(rows) - first]
+            if file.readinto(block.view(np.uint8).data) < block.nbytes:
+                block[:] = rows[first : first + len(block)]  # an interrupted read
+                file.seek(rows.offset + (first + len(block)) * rows.itemsize)
+            yield first, block
 
 
 def read_header(path: str | os.PathLike[str]) -> PlyFile:

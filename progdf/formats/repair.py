@@ -239,11 +239,16 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
 
 
 def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normalized quaternions [N,4], and the length each was divided by: exactly 1 if unchanged. [N]"""
+    """Return normalized quaternions [N,4], and the length each was divided by: exactly 1 if unchanged. [N]
+
+    The quaternions are returned as they are, without a copy, if all lengths are 1.
+    """
     lengths = quats.norm(dim=1)
-    lengths = torch.where((lengths - 1).abs() <= UNIT_TOLERANCE, 1.0, lengths)
-    is_regular = (lengths > MIN_QUAT) & lengths.isfinite()
+    lengths.masked_fill_((lengths - 1).abs_() <= UNIT_TOLERANCE, 1.0)
+    if bool((lengths == 1).all()):
+        return quats, lengths
     unit = quats / lengths[:, None]
+    is_regular = (lengths > MIN_QUAT) & lengths.isfinite()
     if not bool(is_regular.all()):
         unit[~is_regular] = normalize_quats(quats[~is_regular])
     return unit, lengths

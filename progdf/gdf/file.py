@@ -130,7 +130,7 @@ def fingerprint(scene: Gaussians) -> SceneFingerprint:
     known_state, sha256 = _FINGERPRINTS.get(means, (None, ""))
     if state is None or state != known_state:
         world = means.detach() if scene.origin == ZERO else scene.world_means
-        content = world.to("cpu", torch.float32).contiguous().numpy().tobytes()
+        content = world.to("cpu", torch.float32).contiguous().numpy().data
         sha256 = hashlib.sha256(content).hexdigest()
         _FINGERPRINTS[means] = state, sha256
     return SceneFingerprint(len(scene), sha256)

@@ -18,6 +18,7 @@ from plyfile import PlyData, PlyElement
 import progdf
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
+from progdf.formats.ply_file import read_header, row_blocks
 from progdf.gaussians import ATTRIBUTES
 from tests.helpers.ply_files import (
     COUNT,
@@ -98,6 +99,16 @@ def test_many_blocks_and_threads_keep_the_row_order(tmp_path: Path) -> None:
     assert_same(load_ply(tmp_path / "scene.ply"), scene)
     mixed = with_extra("label", "u1", 3)(table_of(scene))
     assert_same(load_ply(write(tmp_path / "mixed.ply", mixed)), scene)
+
+
+def test_blocks_are_read_from_the_file_of_mapped_rows(tmp_path: Path) -> None:
+    (mapped,), _ = read_header(write(tmp_path / "scene.ply", table_of(scene_of()))).rows("vertex")
+    assert isinstance(mapped, np.memmap)
+    assert mapped.filename  # without a name, pages of the mapping are kept
+    read = [(first, block.copy()) for first, block in row_blocks(mapped, 7)]
+    plain = list(row_blocks(np.array(mapped), 7))
+    assert [first for first, _ in read] == [first for first, _ in plain]
+    assert all(np.array_equal(a, b) for (_, a), (_, b) in zip(read, plain, strict=True))
 
 
 def test_crlf_headers_and_comments_are_read(tmp_path: Path) -> None:
