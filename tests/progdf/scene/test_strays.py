@@ -143,13 +143,41 @@ def test_shortcuts_find_the_strays_of_a_full_search(
     )
 
 
+@pytest.mark.parametrize("returned", [0, 40])
+def test_cached_neighborhoods_equal_new_ones_after_members_change(returned: int) -> None:
+    draws = np.random.default_rng(0)
+    points = draws.normal(size=(2000, 3)).astype(np.float32)
+    points[:60] = 0.01 * points[:60] + 5.0  # leaves together, so that the tree is built again
+    extents = draws.uniform(0.0, 0.4, 2000)
+    cached = strays._Neighborhoods(points, extents)
+    is_member = np.ones(2000, bool)
+    for _ in range(4):
+        cached.set_members(is_member.copy())
+        fresh = strays._Neighborhoods(points, extents)
+        fresh.set_members(is_member.copy())
+        everyone = np.arange(2000)
+        assert np.array_equal(cached.find_isolated(), fresh.find_isolated())
+        assert np.array_equal(cached.emptiness(everyone, ends), fresh.emptiness(everyone, ends))
+        assert np.array_equal(cached.loneliness(cached.members), fresh.loneliness(fresh.members))
+        is_member[draws.integers(0, 2000, 40)] = False
+        is_member[:55] = False
+        is_member[draws.integers(0, 2000, returned)] = True
+
+
+def ends(rows: strays.Rows) -> strays.Floats:
+    """Return four positions for each row. [M] -> [M,4,3]"""
+    return np.sin(rows[:, None, None] + 10.0 * np.arange(12.0).reshape(4, 3))
+
+
 def test_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatch) -> None:
     searched = []
     search = strays._Neighborhoods._search
 
-    def counted(body: strays._Neighborhoods, rows: strays.Rows) -> tuple[strays.Floats, strays.Rows]:
+    def counted(
+        body: strays._Neighborhoods, rows: strays.Rows, count: int
+    ) -> tuple[strays.Floats, strays.Rows]:
         searched.append(len(rows))
-        return search(body, rows)
+        return search(body, rows, count)
 
     monkeypatch.setattr(strays._Neighborhoods, "_search", counted)
     for limit in ("_MAX_EXACT_GAUSSIANS", "_EMPTINESS_SAMPLE", "_LONELINESS_SAMPLE"):
