@@ -182,6 +182,32 @@ def test_key_is_never_sent_unencrypted_to_another_machine(monkeypatch: pytest.Mo
         check_api(options.text, options)
 
 
+def test_redirection_sends_no_picture_to_another_address() -> None:
+    with image_server() as other:
+        headers = {"Location": f"{other.url}/images/edits"}
+        moved = Refusal(307, "", "moved", headers)
+        with (
+            image_server(lambda call, number: moved) as server,
+            pytest.raises(ProgdfError, match="it redirects to another address"),
+        ):
+            paint_first(settings_of(server.url))
+    assert len(server.calls) == 1
+    assert not other.calls
+
+
+@pytest.mark.parametrize("status", [400, 401, 429])
+def test_error_that_quotes_the_key_hides_it(status: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "sk-secret")
+    monkeypatch.setattr("trainer.editors.server.calls.RETRIES", 0)
+    with (
+        image_server(lambda call, number: Refusal(status, "", f"bad header {call.key}!")) as server,
+        pytest.raises(ProgdfError) as error,
+    ):
+        paint_first(settings_of(server.url))
+    assert "bad header Bearer (key)!" in str(error.value)
+    assert "sk-secret" not in str(error.value)
+
+
 SIZES = ("1024x1024", "1024x1536", "1536x1024")
 BAD_SIZE = "Invalid value: '{}'. Supported values are: " + ", ".join(f"'{size}'" for size in SIZES)
 

@@ -6,6 +6,7 @@ import email.utils
 import http.client
 import io
 import ipaddress
+import os
 import tempfile
 import time
 import urllib.error
@@ -25,6 +26,9 @@ from progdf.io.images import read_picture, to_picture
 from progdf.io.picture_camera import find_picture_camera
 from progdf.terminal import escape_text, shorten
 from trainer.options import EditorOptions
+
+KEY = "OPENAI_API_KEY"
+"""Environment variable of a server's key. A server on this machine may need none."""
 
 RETRIES = 5
 """Number of times that a failed call is made again."""
@@ -228,8 +232,12 @@ _OPENER = urllib.request.build_opener(_SameHost)
 
 
 def one_line(reason: object) -> str:
-    """Return a text of a server or an error, on one line and shortened."""
-    return shorten(escape_text(" ".join(str(reason).split())), 160)
+    """Return a text of a server or an error, on one line and shortened, without the key that it may quote."""
+    text = " ".join(str(reason).split())
+    key = os.environ.get(KEY, "")
+    if key:
+        text = text.replace(key, "(key)")
+    return shorten(escape_text(text), 160)
 
 
 def png(picture: Tensor) -> bytes:

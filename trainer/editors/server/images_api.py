@@ -22,7 +22,6 @@ from urllib.parse import urlsplit
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.terminal import escape_text, shorten
 from trainer.editors.cache import Recipe
 from trainer.editors.instruct import sentence
 from trainer.editors.painter import PaintRequest, RefusedError
@@ -30,6 +29,7 @@ from trainer.options import EditorOptions
 
 from .calls import (
     BUSY_STATUSES,
+    KEY,
     Address,
     BusyError,
     check_anchor,
@@ -40,9 +40,6 @@ from .calls import (
     retry_after,
 )
 from .canvas import Canvas, Size, best_canvas, named_sizes
-
-KEY = "OPENAI_API_KEY"
-"""Environment variable of the server's key. A server on this machine may need none."""
 
 _MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
 _REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
@@ -142,6 +139,8 @@ class ImagesApi:
             api_key=os.environ.get(KEY) or "none",
             timeout=self.timeout,
             max_retries=0,
+            # a redirection would send the pictures to a machine that the user has not agreed to
+            http_client=openai.DefaultHttpxClient(follow_redirects=False),
         )
         with client:
             try:
@@ -181,7 +180,7 @@ class ImagesApi:
         if urlsplit(url).scheme not in schemes:
             expected = " or ".join(f"{scheme}://" for scheme in schemes)
             raise self.address.fault(
-                f"returned an address that does not begin with {expected}: {shorten(escape_text(url))}"
+                f"returned an address that does not begin with {expected}: {one_line(url)}"
             )
         try:
             with urllib.request.urlopen(url, timeout=self.timeout) as answer:
@@ -206,6 +205,8 @@ class ImagesApi:
             404: "check --api-url and --model",
             429: "wait, or use fewer --edit-workers",
         }.get(status, "check --model and --api-references")
+        if 300 <= status < 400:
+            advice = "it redirects to another address; check --api-url"
         fault = self.address.fault(f"refuses the call with status {status} ({message}); {advice}")
         if status in BUSY_STATUSES and code != "insufficient_quota":
             return BusyError(fault, retry_after(error.response.headers))
