@@ -35,7 +35,7 @@ from .pictures import (
 )
 from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .server.comfy import check_comfy
-from .server.editor import api, comfy
+from .server.editor import api, check_served, comfy
 from .server.images_api import check_api
 from .style import check_style, style
 
@@ -242,6 +242,16 @@ def check_new_editor(options: EditorOptions) -> None:
     row = editor_row(options)
     if row.check is not None:
         row.check(options.text, options)
+
+
+def check_server(options: EditorOptions) -> None:
+    """Check that the editor's server answers, if it has one. No picture is sent.
+
+    Raises:
+        ProgdfError: nothing listens at its address, or it cannot run the workflow.
+    """
+    if editor_row(options).sends_pictures:
+        check_served(options).connect()
 
 
 def make_editor(

@@ -18,7 +18,7 @@ from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from progdf.scene.taken_views import find_taken_view
-from trainer.editors import check_editor, check_new_editor, editor_row
+from trainer.editors import check_editor, check_new_editor, check_server, editor_row
 from trainer.options import TrainOptions, flat_values
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.resolve import recorded_options
@@ -45,8 +45,8 @@ def check_command(options: TrainOptions) -> None:
         options: resolved options
 
     Raises:
-        ProgdfError: the folder is occupied, the editor or the segmenter cannot run, a file is missing, or a
-            text for the run's record is not UTF-8.
+        ProgdfError: the folder is occupied, the editor or the segmenter cannot run, its server cannot be
+            reached, a file is missing, or a text for the run's record is not UTF-8.
     """
     for name, _, value in flat_values(recorded_options(options)):
         for part in value if isinstance(value, tuple) else (value,):
@@ -73,6 +73,8 @@ def check_command(options: TrainOptions) -> None:
     is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
     if is_new or (editor_row(options.editor).slow_strengths and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
+    if is_new:  # an earlier run of the folder may have kept all pictures
+        check_server(options.editor)
 
 
 def shown_pictures(options: TrainOptions) -> tuple[Path, ...]:

@@ -6,6 +6,7 @@ import base64
 import contextlib
 import os
 import re
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -25,6 +26,8 @@ from trainer.editors.server.calls import Address, BusyError
 from trainer.editors.server.editor import ServedEditor, check_served, explain_sending
 from trainer.editors.server.images_api import ImagesApi, check_api
 from trainer.options import EditorOptions, with_values
+from trainer.resolve import resolve
+from trainer.run.command import check_command
 
 MARBLE = 'api:"turn it into marble"'
 
@@ -139,12 +142,25 @@ def test_dead_server_is_a_one_line_error() -> None:
         paint_first(settings_of(url))
 
 
+def test_dead_server_is_reported_before_the_run_is_prepared(tmp_path: Path) -> None:
+    with image_server() as server:
+        write_bear(tmp_path)
+        options = quick_options(tmp_path, editor=MARBLE, model="marble-1", api_url=server.url)
+        check_command(resolve(options))
+        assert not server.calls, "nothing is sent"
+    with pytest.raises(ProgdfError, match=r"cannot be reached .*; check --api-url"):
+        check_command(resolve(options))
+    assert not (tmp_path / "run").exists()
+
+
 def test_refused_connection_ends_the_calls_and_a_lost_one_does_not() -> None:
     address = Address("api", "http://127.0.0.1:8080/v1")
     lost = OSError("no route to host")
     assert isinstance(address.unreachable(lost), BusyError)
     lost.__cause__ = ConnectionRefusedError(111, "Connection refused")
     assert isinstance(address.unreachable(lost), ProgdfError)
+    unknown = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+    assert isinstance(address.unreachable(unknown), ProgdfError)
 
 
 def test_refused_picture_is_told_from_a_fault() -> None:

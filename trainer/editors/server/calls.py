@@ -7,6 +7,7 @@ import http.client
 import io
 import ipaddress
 import os
+import socket
 import tempfile
 import time
 import urllib.error
@@ -195,13 +196,17 @@ class Address:
     def unreachable(self, reason: object) -> ProgdfError | BusyError:
         """Return the error of a call without a connection.
 
-        A machine that refuses the connection has no server at this address, so waiting is of no use.
+        A machine that refuses the connection has no server at this address, and an unknown name has no
+        machine, so waiting is of no use.
         """
         fault = self.fault(f"cannot be reached ({one_line(reason)}); check --api-url")
         cause = reason if isinstance(reason, BaseException) else None
-        while cause is not None and not isinstance(cause, ConnectionRefusedError):
+        while cause is not None:
+            is_unknown_name = isinstance(cause, socket.gaierror) and cause.errno == socket.EAI_NONAME
+            if is_unknown_name or isinstance(cause, ConnectionRefusedError):
+                return fault
             cause = cause.__cause__
-        return BusyError(fault) if cause is None else fault
+        return BusyError(fault)
 
     def read_picture(self, content: bytes, size: tuple[int, int]) -> Tensor:
         """Return a picture of the server at a width and height, whose proportions it must have. [H,W,3]

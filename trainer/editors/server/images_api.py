@@ -12,6 +12,7 @@ import binascii
 import http.client
 import os
 import urllib.request
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
@@ -41,6 +42,7 @@ from .calls import (
 )
 from .canvas import Canvas, Size, best_canvas, named_sizes
 
+_CONNECT_TIMEOUT_S = 5.0  # wait for the answer that tells that a server is there
 _MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
 _REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
 
@@ -88,7 +90,9 @@ class ImagesApi:
         return f"model {self.model}"
 
     def connect(self) -> None:
-        """See `ImageModel.connect`. The first picture tests the server, as a test would cost a call."""
+        """See `ImageModel.connect`. Any answer passes: only a picture would test the model, and it costs."""
+        with suppress(BusyError):  # calls wait for a busy server
+            self.address.request("", _CONNECT_TIMEOUT_S)
 
     def edit(self, request: PaintRequest, prompt: str, stop: Event) -> Tensor:
         """See `ImageModel.edit`."""
