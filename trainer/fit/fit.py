@@ -152,13 +152,21 @@ def measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evalu
     errors = FieldEvaluator(trajectory.s, trajectory.offsets, reporting.counted_pixels, trajectory.at)
     if best.to_editor is not None:
         choice = replace(choice, why=f"{choice.why}, with it {best.to_editor:.1f} dB")
-    baselines = dict[str, Candidate]()
+    baselines = {
+        name: errors.candidate(field, name.replace("keyframes", "") + " keyframes")
+        for name, field in fit_baselines(trajectory).items()
+    }
+    return Fitted(errors.candidate(best.field, best.label), choice, baselines)
+
+
+def fit_baselines(trajectory: Trajectory) -> dict[str, BakedField]:
+    """Return the keyframe fields of `BASELINES` by name, on the trajectory's slider."""
+    fields = dict[str, BakedField]()
     for count in BASELINES:
         rows = keyframe_rows(trajectory.s, count)
         nodes = torch.stack([trajectory.node(i) for i in rows])
-        field = fit_keyframes(trajectory.s[rows], nodes, count, trajectory.s.tolist())
-        baselines[f"keyframes{count}"] = errors.candidate(field, f"{count} keyframes")
-    return Fitted(errors.candidate(best.field, best.label), choice, baselines)
+        fields[f"keyframes{count}"] = fit_keyframes(trajectory.s[rows], nodes, count, trajectory.s.tolist())
+    return fields
 
 
 def expected_renders(trajectory: Trajectory, kind: FieldKind) -> int:

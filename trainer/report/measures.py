@@ -12,18 +12,19 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.baked import SliderRemap
 from progdf.field.choose import sample_strengths
 from progdf.field.trajectory import Trajectory
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf
 from progdf.metrics.image import decibels
 from progdf.metrics.slider import Pictures, SliderStatistics, slider_statistics
 from progdf.rasterize import alpha_weights, render
 from progdf.terminal import format_count, group_digits
 from trainer.editors.pictures import picture_background, read_edit
+from trainer.fit.delivered import DeliveredEdit
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.carry_on import draw_behind
@@ -141,9 +142,8 @@ class Measured:
     Figures of the edit use all held-out views; errors of the field use those that it was not chosen on.
     """
 
-    fitted: Fitted  # the field and its baselines, on the trajectory's slider
-    shown: BakedField  # the shipped field, on its own slider
-    remap: SliderRemap  # from the trajectory's slider to the shipped one
+    edit: DeliveredEdit
+    shown: BakedField  # the shipped field, with the discs for fine paint if there are any
     # slider value and strength of each set of editor pictures
     asked: Sequence[tuple[float, float]]
     slider: SliderStatistics  # uniformity and monotonicity of the slider
@@ -157,10 +157,7 @@ class Measured:
 
 def measure(
     judges: tuple[Evaluator, Evaluator],
-    trajectory: Trajectory,
-    fitted: Fitted,
-    shipped: BakedField,
-    remap: SliderRemap,
+    edit: DeliveredEdit,
     perceptual: Perceptual | None,
     clip: Direction,
 ) -> Measured:
@@ -168,31 +165,31 @@ def measure(
 
     Args:
         judges: evaluators of all held-out views, and of those on which the field was not chosen
-        trajectory: the recorded trajectory
-        fitted: the field and its baselines
-        shipped: the shipped field
-        remap: from the trajectory's slider to the shipped field's
+        edit: the edit as delivered
         perceptual: see `error_curves`
         clip: finished CLIP measurement, or the reason if there is none
     """
     evaluator, reporting = judges
-    field = fitted.chosen.field
-    linear = fitted.baselines[COMPARED].field
+    trajectory = edit.trajectory
+    shipped = edit.gdf.field
+    remap = edit.remap
+    linear = edit.baselines[COMPARED].field
     slider = slider_statistics(evaluator.course(shipped), masks=evaluator.pixels)
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
     drawn = against_editor(evaluator, {"slider": shipped, COMPARED: linear}, stages, perceptual, most=1)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _RECORDING_SAMPLES))].tolist()
     worst = min(
         (
-            reporting.psnr(reporting.pictures(field.offsets(s)), reporting.pictures(trajectory.at(s)))
+            reporting.psnr(
+                reporting.pictures(shipped.offsets(remap.at(s))), reporting.pictures(trajectory.at(s))
+            )
             for s in nodes
         ),
-        default=fitted.chosen.worst,
+        default=edit.chosen.worst,
     )
     return Measured(
-        fitted,
+        edit,
         shipped,
-        remap,
         asked=stages,
         slider=slider,
         at_recordings=worst,
@@ -239,6 +236,27 @@ def clip_curve(
     return Direction(CLIP_STRENGTHS, tuple(similarity), clip.name)
 
 
+def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
+    """Return the largest difference of the edit at s = 1 from the recorded end, and outside the region.
+
+    Both are differences of raw parameters. The second is the change of Gaussians that must not change.
+    """
+    outside = ~gdf.region.mask
+    finished = edited_scene(scene, gdf)
+    members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
+    packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
+    endpoint = float((packed - end).abs().max())
+    change = 0.0
+    for s in (0.3, 1.0):
+        edited = edited_scene(scene, gdf, s)
+        for name in ATTRIBUTES:
+            before = getattr(scene, name)[outside]
+            after = getattr(edited, name)[: len(scene)][outside]
+            if before.numel() and not torch.equal(before, after):
+                change = max(change, float((after - before).abs().max()))
+    return endpoint, change
+
+
 def delivered_figures(
     fitted: Fitted, shown: BakedField, endpoint_error: float, outside_change: float, psnr: float
 ) -> dict[str, Any]:
@@ -247,7 +265,7 @@ def delivered_figures(
     Args:
         fitted: the field and its baselines
         shown: the shipped field
-        endpoint_error, outside_change: see `exactness` in `trainer.run.finish`
+        endpoint_error, outside_change: see `exactness`
         psnr: PSNR of the full edit against the editor's pictures on held-out views, dB
     """
     return {
@@ -266,7 +284,7 @@ def delivered_figures(
 
 def measured_figures(measured: Measured) -> dict[str, Any]:
     """Return the part of report.json that is measured after the edit's file is written."""
-    fitted = measured.fitted
+    delivered = measured.edit
     slider = measured.slider
     drawn = measured.editor["slider"]
     linear = measured.editor[COMPARED]
@@ -298,9 +316,9 @@ def measured_figures(measured: Measured) -> dict[str, Any]:
         },
         "curves": {
             "against_trajectory": {
-                "s": [_round4(measured.remap.at(s)) for s in sample_strengths()],
-                "slider": [round(psnr, 2) for psnr in fitted.chosen.curve],
-                COMPARED: [round(psnr, 2) for psnr in fitted.baselines[COMPARED].curve],
+                "s": [_round4(delivered.remap.at(s)) for s in sample_strengths()],
+                "slider": [round(psnr, 2) for psnr in delivered.chosen.curve],
+                COMPARED: [round(psnr, 2) for psnr in delivered.baselines[COMPARED].curve],
             },
             "against_editor": {name: found.to_json() for name, found in measured.editor.items()},
             "change": {

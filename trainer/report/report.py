@@ -45,7 +45,7 @@ def report_picture(
         held_out: number of held-out views among the evaluated ones
     """
     chosen = measured.shown
-    linear = measured.fitted.baselines[COMPARED].field
+    linear = measured.edit.baselines[COMPARED].field
     columns = columns_of(measured.asked)
     sheet = to_picture(
         contact_sheet(
@@ -122,9 +122,9 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
 
 def _error_plots(measured: Measured) -> list[Plot]:
     """Plot errors of all measured fields against the recording, and of two fields against the editor."""
-    fitted = measured.fitted
-    s = [measured.remap.at(s) for s in sample_strengths()]
-    fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
+    edit = measured.edit
+    s = [edit.remap.at(s) for s in sample_strengths()]
+    fields = {edit.chosen.field.kind: edit.chosen, **edit.baselines}
     recorded: dict[str, Points] = {
         f"{_label(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
         for name, found in fields.items()

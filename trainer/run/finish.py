@@ -15,13 +15,14 @@ from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField, identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
+from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, anchor_added, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, to_json
 from progdf.rasterize import activate
 from progdf.terminal import file_size, format_count
 from progdf.threads import map_threads
+from trainer.fit.delivered import DeliveredEdit, save_delivered
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, visibility
 from trainer.fit.grades import fit_grades
@@ -39,6 +40,7 @@ from trainer.report.measures import (
     carry_figures,
     clip_curve,
     delivered_figures,
+    exactness,
     expected_measures,
     measure,
     measure_above,
@@ -66,6 +68,9 @@ _KEYS_OF_REPORT_ONLY = (
     *("losses", "trajectory", "effort", "choice", "baselines"),
 )
 DEFAULTS = to_json(BLANK)
+
+RECORDED = "recorded"
+"""Part of the saved state with the seconds of the finished stages, from the recording on."""
 
 _LPIPS_AREA = "each view's box around the region and all edited pixels, at least 64 pixels per side"
 
@@ -108,9 +113,7 @@ def finish_run(
     begun: Saved | None = None,
     request: ReportRequest = FULL_REPORT,
 ) -> RunResult:
-    """Fit the field and deliver NAME.gdf, then write the report: report.json and report.png.
-
-    The report never changes NAME.gdf. If it is stopped, report.json has the figures known at the delivery.
+    """Fit the field and deliver NAME.gdf, then write the report, see `report_run`.
 
     Args:
         folder: folder of the run
@@ -139,7 +142,6 @@ def finish_run(
             field, remap = equalize_slider(field, grown, log)
         if field.attributes:  # report the endpoint of the written field instead of the recorded one
             trajectory = replace(trajectory, end=field.offsets(1.0))
-        shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(_choice_line(fitted, field.bytes_per_member, len(trajectory), len(reporting.names)))
     with log.stage("deliver"):
         gdf = _build_gdf(options, setup, field, grown.scene[len(scene) :])
@@ -147,6 +149,7 @@ def finish_run(
         pictures = {path: view.camera for path, view in pairs}
         sharpened = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log, setup.seen)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
+        edit = DeliveredEdit.of(gdf, sharpened, trajectory, remap, fitted)
         displayed = evaluator
         if sharpened is not None:
             gdf = sharpened
@@ -164,7 +167,7 @@ def finish_run(
             "report": "none",
             **figures,
             "views": _view_figures(setup, evaluator),
-            "trajectory": _trajectory_figures(shipped, slider, record),
+            "trajectory": _trajectory_figures(edit.shipped, slider, record),
             **_record_figures(record),
             "paint": paint.figures() if paint is not None else None,
             **carry_figures(setup, trajectory, record.effort, folder.behind),
@@ -172,33 +175,86 @@ def finish_run(
             "plan": to_json(options),
         }
     earlier = _earlier_seconds(folder) if log.refits else {}
-    result = replace(_deliver(folder, gdf, report, setup, paint, log, earlier), trajectory=shipped)
+    result = replace(_deliver(folder, gdf, report, setup, paint, log, earlier), trajectory=edit.shipped)
+    if not log.refits:
+        save_delivered(folder.state, edit)
+        folder.state.save(RECORDED, {}, log.capture_state().values)
     request.on_delivery()
-    if request.level == "none":
+    views = evaluator, displayed
+    return report_run(result, edit, setup, record, perceptual, log, request.level, views)
+
+
+def report_run(
+    result: RunResult,
+    edit: DeliveredEdit,
+    setup: TrainingSetup,
+    record: RunRecord,
+    perceptual: Perceptual,
+    log: RunLog,
+    level: ReportLevel,
+    views: tuple[Evaluator, Evaluator] | None = None,
+) -> RunResult:
+    """Measure a delivered edit, and write the report: report.json and report.png.
+
+    The report never changes NAME.gdf. If it is stopped, report.json has the figures known at the delivery.
+
+    Args:
+        result: the delivered edit, with its report so far and its recordings
+        edit: see `DeliveredEdit`
+        setup, record: see `finish_run`
+        perceptual: image distance
+        log: log of the run
+        level: extent of the report
+        views: evaluators of the edit without and with the discs for fine paint; None: made here
+    """
+    if level == "none":
         return result
+    options = record.plan
+    if views is None:
+        plain = load_evaluator(
+            result.folder, setup.extend(edit.trajectory.added), setup.judging, edit.trajectory
+        )
+        sharp = edit.sharpened
+        views = plain, plain
+        if sharp is not None:
+            views = plain, load_evaluator(result.folder, setup, setup.judging, edit.trajectory, sharp)
+    evaluator, displayed = views
+    earlier = result.report["time"]
     with log.stage("report"):
-        is_full = request.level == "full"
+        is_full = level == "full"
         distance = perceptual if is_full else None
         clip = Direction(reason="the report is short")
         if is_full:
-            clip = clip_curve(evaluator, setup.judging, field, options.texts)
+            clip = clip_curve(evaluator, setup.judging, edit.gdf.field, options.texts)
             if clip.reason and options.texts.asked:
                 log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        with log.looks("measure the edit", expected_measures(trajectory)) as count_view:
+        with log.looks("measure the edit", expected_measures(edit.trajectory)) as count_view:
+            _, reporting = evaluator.halves()
             judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
-            measured = measure(judges, trajectory, fitted, field, remap, distance, clip)
-        if sharpened is not None:
-            slider_measures = against_editor(
-                displayed, {"slider": sharpened.field}, measured.asked, distance, most=1
-            )
-            measured = replace(measured, shown=sharpened.field, editor={**measured.editor, **slider_measures})
+            measured = measure(judges, edit, distance, clip)
+        if edit.sharpened is not None:
+            field = edit.sharpened.field
+            slider_measures = against_editor(displayed, {"slider": field}, measured.asked, distance, most=1)
+            measured = replace(measured, shown=field, editor={**measured.editor, **slider_measures})
         picture = None
         if is_full:
             title = f"{options.name}: {options.editor.editor}"
             count = len(setup.held_out)
             picture = report_picture(evaluator, displayed, measured, record.losses, title, count)
-    report = _with_measures(report, measured_figures(measured)) | {"report": request.level}
+    report = _with_measures(result.report, measured_figures(measured)) | {"report": level}
     return _write_report(result, report, picture, log, earlier)
+
+
+def read_report(folder: RunFolder) -> dict[str, Any]:
+    """Return the content of a run's report.json.
+
+    Raises:
+        ProgdfError: it is damaged.
+    """
+    try:
+        return convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
+    except ValueError as error:
+        raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
 
 
 def _build_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
@@ -454,27 +510,6 @@ def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
     return rows + trajectory.end
 
 
-def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
-    """Return the largest difference of the edit at s = 1 from the recorded end, and outside the region.
-
-    Both are differences of raw parameters. The second is the change of Gaussians that must not change.
-    """
-    outside = ~gdf.region.mask
-    finished = edited_scene(scene, gdf)
-    members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
-    packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
-    endpoint = float((packed - end).abs().max())
-    change = 0.0
-    for s in (0.3, 1.0):
-        edited = edited_scene(scene, gdf, s)
-        for name in ATTRIBUTES:
-            before = getattr(scene, name)[outside]
-            after = getattr(edited, name)[: len(scene)][outside]
-            if before.numel() and not torch.equal(before, after):
-                change = max(change, float((after - before).abs().max()))
-    return endpoint, change
-
-
 def _earlier_seconds(folder: RunFolder) -> dict[str, float]:
     """Return the seconds of the stages that a refit does not repeat."""
     try:
@@ -492,10 +527,7 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
     if folder.trajectory.is_file():
         recorded, _, _ = load_trajectory(folder.trajectory)
         trajectory = replace(recorded, s=torch.tensor(gdf.field.recorded))
-    try:
-        report = convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
-    except ValueError as error:
-        raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
+    report = read_report(folder)
     log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")
     return RunResult(folder, path, report, trajectory)
 

@@ -11,6 +11,7 @@ import torch
 from progdf.field.trajectory import Trajectory
 from progdf.io.cameras import save_cameras
 from trainer.editors import editor_row
+from trainer.fit.delivered import load_delivered
 from trainer.fit.fit import choose_path, drop_idle_attributes, may_have_idle_attributes
 from trainer.methods import METHODS
 from trainer.optimize.growth import fade_in
@@ -31,11 +32,14 @@ from trainer.views.view import BACKGROUND
 from .edited_views import EditedViews
 from .finish import (
     FULL_REPORT,
+    RECORDED,
     ReportRequest,
     RunResult,
     end_rows,
     finish_run,
     load_evaluator,
+    read_report,
+    report_run,
     write_finals,
 )
 from .record import RunRecord, load_recording, save_recording
@@ -72,7 +76,7 @@ def train_region(
         setup = METHODS[options.preset].box_views(setup, train_edits)
     if views.optimization.solver == "colors":  # small sums: torch's threads spun for 100 s on 16 cores
         torch.set_num_threads(1)
-    recorded = folder.state.load("recorded")
+    recorded = folder.state.load(RECORDED)
     if recorded is None:
         _save_trajectory(options, setup, views, perceptual, folder, log)
     else:
@@ -80,9 +84,16 @@ def train_region(
         log.say("the trajectory is recorded")
     del edited, train_edits, views  # the needed parts are read again from disk
     trajectory, record = load_recording(folder)
-    begun = folder.state.load(NETWORK)
     setup = setup.keep_solved(record.effort)
-    result = finish_run(folder, setup, trajectory, record, perceptual, log, begun, request)
+    delivered = load_delivered(folder.state, setup.scene, trajectory)
+    if delivered is None:
+        begun = folder.state.load(NETWORK)
+        result = finish_run(folder, setup, trajectory, record, perceptual, log, begun, request)
+    else:
+        log.say(f"{options.name} is ready; completing its report")
+        request.on_delivery()
+        result = RunResult(folder, folder.gdf(options.name), read_report(folder), delivered.shipped)
+        result = report_run(result, delivered, setup, record, perceptual, log, request.level)
     # only at the end, as a stopped run needs all views to resume
     save_cameras(folder.cameras, [view.camera for view in setup.views], setup.scene.origin)
     remove_stale_views(folder, [view.camera.name for view in setup.views])
@@ -121,7 +132,7 @@ def _save_trajectory(
         grown = setup.extend(trajectory.added)
         finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
         write_finals(setup, finals, folder, log)
-    folder.state.save("recorded", {}, log.capture_state().values)
+    folder.state.save(RECORDED, {}, log.capture_state().values)
 
 
 def _agreement(
