@@ -1,5 +1,7 @@
 """Queue of child processes: one training run at a time, and deliveries (exports, pictures, films).
 
+A run trains until its edit is written. Its report goes on at low priority beside the next run.
+
 Children are polled. Only `JobQueue.close` waits for them.
 """
 
@@ -232,10 +234,16 @@ class JobQueue:
             elif child is not None and reads_progress:
                 self._follow(job)
         for job in self.jobs:
-            trains = any(isinstance(j.task, EditOrder) and j.number in self._children for j in self.jobs)
-            if job.status == "queued" and not (trains and isinstance(job.task, EditOrder)):
+            waits = isinstance(job.task, EditOrder) and self._trains()
+            if job.status == "queued" and not waits:
                 ended.append(self._start(job))
         return [job for job in ended if job is not None]
+
+    def _trains(self) -> bool:
+        """Return True while a run trains, or while two runs write their reports, which take memory too."""
+        runs = [job.task for job in self.jobs if job.number in self._children]
+        orders = [run for run in runs if isinstance(run, EditOrder)]
+        return len(orders) > 1 or any(not order.is_delivered for order in orders)
 
     def next_poll(self) -> float | None:
         """Return the seconds until the next poll; None if no job is busy."""

@@ -52,6 +52,12 @@ def begin(out: Path) -> None:
     (out / "state" / "run.json").touch()
 
 
+def deliver(edit_order: EditOrder) -> None:
+    """Write the files of an edit whose report is not complete."""
+    edit_order.result.touch()
+    (edit_order.out / "report.json").touch()
+
+
 @pytest.fixture
 def stopped(scene: Path, monkeypatch: pytest.MonkeyPatch) -> EditOrder:
     """Return the order of a stopped run. Children are stubs and every poll checks all jobs."""
@@ -156,6 +162,28 @@ def test_close_leaves_no_child_and_drops_queued_runs(scene: Path) -> None:
     assert not waiting.out.with_name("red.train.json").exists()
     found = training.stopped_orders(waiting.out.parent, scene)
     assert all(order.out != waiting.out for order in found), "it had not begun"
+
+
+def test_next_run_starts_at_the_delivery_of_the_one_before(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_queue, "Child", Waiting)
+    queue = JobQueue()
+    orders = [order(scene, name) for name in ("blue", "red", "green")]
+    for edit_order in orders:
+        queue.add(edit_order)
+    queue.poll()
+    assert [job.status for job in queue.jobs] == ["running", "queued", "queued"]
+    deliver(orders[0])
+    queue.poll()
+    assert [job.status for job in queue.jobs] == ["running", "running", "queued"]
+    deliver(orders[1])
+    queue.poll()
+    assert [job.status for job in queue.jobs] == ["running", "running", "queued"], "two reports are written"
+    queue.stop(1)
+    queue.poll()
+    assert [job.status for job in queue.jobs] == ["stopped", "running", "running"]
+    queue.close()
 
 
 def test_run_of_another_window_cannot_be_resumed_or_discarded(stopped: EditOrder) -> None:
