@@ -141,6 +141,7 @@ class Canvas:
     def __init__(self, context: moderngl.Context, engine: ViewEngine, last: Canvas | None = None) -> None:
         self.comparer = Comparer(engine, context)
         self._thumbnails = Thumbnails(context)
+        self._photographs = Thumbnails(context)
         self.timings = dynamic_resolution.FrameTimings()
         """Timings of the picture on screen."""
         self.pictures_drawn = 0
@@ -319,6 +320,11 @@ class Canvas:
         names, missing = self._thumbnails.update(draws)
         return Pictures(names[: len(snapshots)], names[len(snapshots) :]), missing
 
+    def photographs(self, draws: Mapping[object, Callable[[], Pixels]]) -> tuple[dict[object, int], bool]:
+        """Return the GL names of photographs that are loaded, by key; True if any is missing."""
+        names, missing = self._photographs.update(draws)
+        return {key: name for key, name in zip(draws, names, strict=True) if name}, missing
+
     def _draw_snapshot(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> Pixels:
         edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
         target = replace(edited, camera=snapshot.camera, compare=Comparison())
@@ -333,3 +339,4 @@ class Canvas:
         """Free everything but the engine."""
         self.comparer.release()
         self._thumbnails.release()
+        self._photographs.release()

@@ -10,7 +10,7 @@ from itertools import zip_longest
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.errors import ProgdfError
-from viewer.panel import dialogs, panel, timeline_bar, tools, view_settings
+from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
@@ -25,6 +25,7 @@ from viewer.ui.search import find_commands
 from viewer.ui.widgets import elide, group_digits, menu, search_field
 
 from . import color_tool, measure, mouse, select_tool
+from .inspect.readouts import Distributions
 from .pull.marks import draw_marks
 
 MOUSE_HELP = (
@@ -262,11 +263,13 @@ def panels(
     pictures: panel.Pictures,
     reveal: bool,
     compared: tuple[Labels, bool],
+    distributions: Distributions,
 ) -> Workspace:
     """Draw the panel, the tools and, if open, the timeline. Further arguments as in `panel.draw`.
 
     Args:
         compared: labels of the comparison on screen, and whether the original is visible
+        distributions: histograms of the scene
     """
     actions: list[Action] = []
     area = pointer.area
@@ -281,6 +284,10 @@ def panels(
     tools.draw_toolbar(work.view, above, ui, actions, _active_tool(work))
     work, foot = tools.draw_options(work, above, ui, actions, select_tool.next_step(work))
     work = replace(work, view=view_settings.draw_view(work.view, above, foot, ui, actions))
+    if work.transient.histogram is not None:
+        found = distributions.get(work.transient.histogram.property, pointer)
+        work, closes = histogram.draw(work, found, above, ui)
+        actions += [closes] if closes is not None else []
     work, asked = draw_pill(work, pointer, compared, foot)
     work = perform_actions(work, [*actions, *asked], pointer)
     return _draw_question(_open_settings(work), pointer)

@@ -19,7 +19,7 @@ from imgui_bundle import imgui
 from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
-from viewer.panel import new_edit_form, pages, panel, timeline_bar
+from viewer.panel import new_edit_form, pages, panel, timeline_bar, tools
 from viewer.pictures.film import Pixels
 from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.render.engine import ViewEngine
@@ -52,6 +52,8 @@ from viewer.ui.pointer import PointerContext
 from . import color_tool, handles, interface, mouse, select_tool
 from .canvas import Canvas, FramePacer, LayersOf, RememberView, forget_view, no_layers
 from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
+from .inspect import frusta
+from .inspect.readouts import Distributions, Inspection
 from .messages import Messages
 from .pull import tool as pull_tool
 
@@ -92,6 +94,8 @@ class MainView:
         self.layers_of: LayersOf = no_layers  # returns the layers of a view for a picture's metadata
         self.surfaces = Surfaces()
         self.decal_surfaces = DecalSurfaces()
+        self.inspection = Inspection()
+        self.distributions = Distributions()
         self.paint = PaintOverlay(context)
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -152,7 +156,14 @@ class MainView:
         picture."""
         old = self.work.transient
         transient = replace(
-            old, cover=None, preview=PreviewState(), gizmo=None, tool=MouseTool(), clone=None, pending=()
+            old,
+            cover=None,
+            preview=PreviewState(),
+            gizmo=None,
+            tool=MouseTool(),
+            clone=None,
+            pending=(),
+            viewpoints=(),
         )
         self.store.replace(
             replace(
@@ -212,6 +223,7 @@ class MainView:
         imgui.get_io().delta_time = max(seconds, 1e-5)
         self._clock += max(seconds, 0.0)
         self._pace.step(seconds)
+        self.inspection.step(seconds)
         self._resting = False
         with self._guard():
             self.store.replace(workspace.advance(self.work, seconds))
@@ -325,7 +337,11 @@ class MainView:
                 if missing:
                     self.wake()
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
-                self.store.replace(interface.panels(self.work, self._pointer(), pictures, reveal, compared))
+                self.store.replace(
+                    interface.panels(
+                        self.work, self._pointer(), pictures, reveal, compared, self.distributions
+                    )
+                )
             self._revealed = self.work.focus, several
         held = self.work.transient.tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
@@ -513,6 +529,13 @@ class MainView:
             self.store.replace(interface.draw_lists(self.work, pointer, offered, pressed))
         labels = self.canvas.comparer.labels(self.work.view)
         self.store.replace(interface.over_picture(self.work, pointer, labels, original))
+        with self._guard():
+            textures, missing = self.canvas.photographs(frusta.thumbnails(self.work.transient.viewpoints))
+            frusta.draw(self.work, pointer, textures)
+            left = tools.LEFT_PX * self.ui.scale
+            self.inspection.draw(self.work, pointer, self.canvas.timings.total_ms, left)
+            if missing:
+                self.wake()
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()

@@ -24,6 +24,7 @@ from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
 from . import color_tool, measure, select_tool
+from .inspect import frusta
 
 REACH_PX = 8.0  # at 1×: the mouse grips the divider within this distance
 DIVIDER = "divider"
@@ -133,6 +134,8 @@ def _handle_release(work: Workspace, pointer: PointerContext) -> Workspace:
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         if work.view.color_brush.tool:
             work = color_tool.pick(work, pointer)
+        elif (viewpoint := frusta.under(work, pointer)) is not None:
+            work = frusta.look_through(work, viewpoint)
         else:
             work = _focus_picked_layer(work, pointer)
     if tool.drag == color_tool.COLOR_DRAG and imgui.is_mouse_released(0):

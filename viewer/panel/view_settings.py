@@ -37,7 +37,7 @@ UPS: dict[str, Vec3] = {
 }
 
 
-_MODE_ROWS = VIEW_MODES[:3], VIEW_MODES[3:]
+_MODE_ROWS = VIEW_MODES[:3], VIEW_MODES[3:6], VIEW_MODES[6:]
 _VIEW_BUTTONS = (("frame", Icon.FRAME), ("home", Icon.HOME))
 
 
@@ -88,6 +88,8 @@ def _view_rows(view: ViewState, ui: UiContext, actions: list[Action]) -> ViewSta
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(view.background), picker)
     background = (red, green, blue) if changed else view.background
+    if menu_item("histogram"):
+        actions.append(Plain("histogram"))
     for action, on in (("grid", view.grid), ("axes", view.axes)):
         if menu_item(action, on):
             actions.append(Plain(action))

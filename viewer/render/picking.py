@@ -17,7 +17,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
-from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, RasterView, activate
+from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, Crop, RasterView, activate
 from progdf.scene.selection import Floats, Mask, Surface
 from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
@@ -25,6 +25,7 @@ from viewer.state.view_state import ViewState
 
 SURFACE_OPACITY = 0.5  # accumulated opacity that defines the surface
 BACKGROUND_OPACITY = 0.05  # accumulated opacity below which a pixel is background
+OUTLINE_POINTS = 32  # number of points of an outline
 MIN_SHARE = 0.25  # share of a pixel's color that a layer needs to be picked
 
 
@@ -126,6 +127,30 @@ def seen_at(
     return PixelGaussians(rows, shares, depth[rows].astype(np.float64))
 
 
+def outlines(
+    scene: Gaussians, rows: NDArray[np.int64], camera: Camera, near: float, sigmas: float = 2.0
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the outlines of Gaussians in the picture.
+
+    Args:
+        scene: the scene
+        rows: Gaussians to outline. [M]
+        camera: the picture's camera
+        near: smallest depth, world units
+        sigmas: distance from the center, standard deviations
+
+    Returns:
+        The drawn ones of `rows` [K], and their outlines in pixels [K,`OUTLINE_POINTS`,2].
+    """
+    splats = _project(scene, rows, camera, near, None)
+    l11, l21, l22 = (column[:, None] for column in splats.whitening.unbind(1))
+    angles = torch.linspace(0.0, 2.0 * math.pi, OUTLINE_POINTS + 1, dtype=torch.float64)[:-1]
+    down = sigmas * angles.sin() / l22
+    across = (sigmas * angles.cos() - l21 * down) / l11
+    points = splats.means2d[:, None] + torch.stack([across, down], dim=2)
+    return rows[splats.rows.numpy()], points.numpy()
+
+
 def _lens(camera: Camera) -> tuple[float, float, float, float]:
     """Return the focal lengths and the principal point, px."""
     fx, fy, cx, cy = (float(v) for v in (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]))
@@ -136,15 +161,22 @@ def _alphas(
     scene: Gaussians, rows: NDArray[np.int64], camera: Camera, x: float, y: float, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the given Gaussians that the rasterizer draws at a position, nearest first, and their alphas."""
-    candidates = scene[torch.from_numpy(rows)]
     pixel = (math.floor(x), math.floor(y), math.floor(x) + 1, math.floor(y) + 1)
-    activated = activate(replace(candidates, means=candidates.means.double()), torch.zeros(len(rows), 3))
-    splats, _ = reference.project(activated, RasterView.of(replace(camera, near=near), activated, pixel))
+    splats = _project(scene, rows, camera, near, pixel)
     l11, l21, l22 = splats.whitening.unbind(1)
     dx, dy = (torch.tensor([x, y], dtype=torch.float64) - splats.means2d).unbind(1)
     alphas = splats.opacities * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
     alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0.0)
     return rows[splats.rows.numpy()], alphas.numpy()
+
+
+def _project(
+    scene: Gaussians, rows: NDArray[np.int64], camera: Camera, near: float, crop: Crop | None
+) -> reference.ReferenceSplats:
+    """Project the given Gaussians in float64."""
+    some = scene[torch.from_numpy(rows)]
+    activated = activate(replace(some, means=some.means.double()), torch.zeros(len(rows), 3))
+    return reference.project(activated, RasterView.of(replace(camera, near=near), activated, crop))[0]
 
 
 PREPARE_MIN_GAUSSIANS = 100_000

@@ -12,22 +12,28 @@ shaders/include/view_modes.glsl has the same formulas.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians
 from progdf.rasterize.engines import ALPHA_MIN
 
 from .highlight import RAMP, rgba
 
 SPLATS = "splats"
+CONTRIBUTION = "contribution"
+"""Mode with the picture of the splats; the window adds a readout at the pointer."""
 CENTERS = "centers"
 RINGS = "rings"
 RECOLORED = ("depth", "normals", "opacity")
 """Modes that change colors alone, in the order of their numbers in the shader, from 1."""
 
+LOGIT_MIN = math.log(ALPHA_MIN / (1.0 - ALPHA_MIN))  # opacity logit below which nothing is drawn
 DOT_PX = 0.7  # standard deviation of a dot before the rasterizer's blur, pixels
 DEPTH_PERCENTILES = (2.0, 98.0)  # ends of the depth range, so that single floaters do not stretch it
 MAX_SAMPLE = 50_000  # number of centers from which the depth range is measured
@@ -55,6 +61,18 @@ def depth_range(means: Tensor, camera: Camera) -> tuple[float, float]:
         return 0.0, 1.0
     near, far = np.percentile(depths[inside], DEPTH_PERCENTILES)
     return float(near), float(max(far, near * (1.0 + 1e-6)))
+
+
+def visible_count(scene: Gaussians, camera: Camera, near: float) -> int:
+    """Return the number of Gaussians whose center is in the picture and that are not transparent."""
+    rotation = camera.viewmat[:3, :3].numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y, depth = rotation @ scene.means.numpy().T + camera.viewmat[:3, 3:].numpy()
+        column = x / depth * float(camera.K[0, 0]) + float(camera.K[0, 2])
+        row = y / depth * float(camera.K[1, 1]) + float(camera.K[1, 2])
+        inside = (column >= 0.0) & (column <= camera.width) & (row >= 0.0) & (row <= camera.height)
+        drawn = scene.logit_opacities.numpy() >= LOGIT_MIN
+    return int(np.count_nonzero(inside & (depth > near) & drawn))
 
 
 def apply(

@@ -33,7 +33,7 @@ from .layers import (
     with_overshoot,
     with_paint,
 )
-from .transient import Measure
+from .transient import Histogram, Measure
 from .view_state import BRUSH_MODES, FRAMES, PAINT_TOOLS, RESOLUTION_MODES, VIEW_MODES, ViewState, following
 from .workspace import (
     MAX_ZOOM,
@@ -293,6 +293,12 @@ def _toggle_measure(workspace: Workspace, _: None) -> Workspace:
     return with_transient(replace(workspace, view=_without_tools(workspace.view)), measure=measure)
 
 
+def _toggle_histogram(workspace: Workspace, _: None) -> Workspace:
+    """Open or close the histogram."""
+    histogram = Histogram() if workspace.transient.histogram is None else None
+    return with_transient(workspace, histogram=histogram)
+
+
 def _set_unit(workspace: Workspace, true_length: float) -> Workspace:
     """Set the true length of the measured distance, which sets the unit of length."""
     measure = workspace.transient.measure
@@ -542,6 +548,8 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "reduced_motion": lambda w, _: replace(
         w, layout=replace(w.layout, reduced_motion=not w.layout.reduced_motion)
     ),
+    "status": lambda w, _: replace(w, layout=replace(w.layout, status=not w.layout.status)),
+    "histogram": _toggle_histogram,
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
     "look": _view_from,
     "view_settings": lambda w, _: replace(w, settings_opening=True),

@@ -19,6 +19,7 @@ from viewer.camera.decal_warp import DecalFrame, DecalMesh
 from viewer.camera.view_camera import Vec3, ViewCamera
 
 from .paint import Stroke
+from .selection import EMPTY_MASK
 from .view_state import Brush, ColorBrush, LayerState, PaintedPicture, SelectTool
 
 
@@ -450,6 +451,28 @@ class StartFile:
 
 
 @dataclass(frozen=True)
+class Histogram:
+    """Open histogram of a property, with its range."""
+
+    property: str = "size"  # key of `viewer.render.properties.PROPERTIES`
+    range: tuple[float, float] | None = None  # selected range on the axis
+    anchor: float | None = None  # end of the range that stays during a drag
+    base: bytes = EMPTY_MASK  # selection before the drag, packed
+    mode: str = "new"  # combination with `base`: new, add or subtract
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Training camera in the picture."""
+
+    name: str  # of the camera, "" for none
+    view: ViewCamera  # view through it
+    eye: Vec3  # its center, world units
+    corners: tuple[Vec3, ...]  # corners of its picture, from the upper left one clockwise. [4]
+    picture: Path | None = None  # its photograph
+
+
+@dataclass(frozen=True)
 class Transient:
     """Transient state of the window."""
 
@@ -461,6 +484,8 @@ class Transient:
     # handles of a selection being moved, a decal being placed, or the Pull tool
     gizmo: Gizmo | Decal | Pull | None = None
     measure: Measure | None = None  # points of the measure tool while it is active
+    viewpoints: tuple[Viewpoint, ...] = ()  # training cameras in the picture
+    histogram: Histogram | None = None  # histogram over the picture
     ghosts: tuple[DecalGhost | PreviewGhost, ...] = ()  # edits in training that have no layer yet
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
     tool: MouseTool = MouseTool()  # drag and gesture of the mouse

@@ -37,7 +37,7 @@ CARD_MODES = ("auto", "full", "compact")
 """Values of `ViewState.cards`: compact rows if full cards do not fit, never, always."""
 FRAMES = ("", *SHAPES)
 """Values of `ViewState.safe_frame`: none, or an aspect ratio of films."""
-VIEW_MODES = ("splats", "centers", "rings", "depth", "normals", "opacity")
+VIEW_MODES = ("splats", "centers", "rings", "depth", "normals", "opacity", "contribution")
 """Values of `ViewState.mode`, see `viewer.render.view_modes`."""
 RESOLUTION_MODES = ("auto", "on", "off")
 """Values of `ViewState.dynamic_resolution`: if it saves time, always, never."""

@@ -154,6 +154,7 @@ class Layout:
     panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # panel width, pixels at 1×
     folded: tuple[str, ...] = (REGIONS_OF_EDITS,)  # folded sections of the panel
     reduced_motion: bool = False  # the camera jumps instead of gliding
+    status: bool = False  # show the status line
 
     def with_panel(self, wide: float) -> Layout:
         """Return the layout with this panel width, in pixels at 1×, clamped and rounded."""

@@ -11,7 +11,7 @@ import moderngl
 from progdf.camera import Camera
 from progdf.compose.picture_layers import find_layer_files
 from progdf.errors import ProgdfError
-from progdf.io.cameras import load_cameras
+from progdf.io.cameras import camera_search_folder, load_cameras
 from progdf.io.picture_camera import (
     PictureLayers,
     camera_file,
@@ -22,6 +22,7 @@ from progdf.io.picture_camera import (
 from progdf.scene.match_views import view_thumbnail
 from progdf.scene.taken_views import FoundView, TakenView, find_view, remember_view, taken_views
 from viewer.app.decal import DecalTextures, is_decal
+from viewer.app.inspect.frusta import viewpoints
 from viewer.app.messages import Messages, Requests, WaitFor
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import exports
@@ -70,7 +71,11 @@ class PictureActions:
     @property
     def requests(self) -> Requests:
         """Handlers of the answers to "Is it this view?", by name. `use_view` names the picture."""
-        return {"use_view": lambda _: self._use_view(), "keep_view": lambda _: self._keep_view()}
+        return {
+            "use_view": lambda _: self._use_view(),
+            "keep_view": lambda _: self._keep_view(),
+            "cameras": lambda _: self._toggle_cameras(),
+        }
 
     def poll(self) -> None:
         """Free the textures of decals that are no longer on screen."""
@@ -85,13 +90,40 @@ class PictureActions:
             remember_view(document.path, image, camera, edits, document.scene.origin, layers)
 
     def look_through(self, path: Path) -> None:
-        """Move the view to the first camera of a file.
+        """Move the view to the first camera of a file, and show all of them in the picture.
 
         Raises:
             ProgdfError: the file holds no camera.
         """
-        self._take_camera(load_cameras(path, self._documents.get().scene.origin)[0])
+        cameras = load_cameras(path, self._documents.get().scene.origin)
+        self._take_camera(cameras[0])
+        if len(cameras) > 1:
+            self._show_cameras(cameras, path if path.is_dir() else path.parent)
         self._messages.show(f"View set to the first camera of {path.name}")
+
+    def _toggle_cameras(self) -> None:
+        """Hide the cameras in the picture, or show those beside the scene.
+
+        Raises:
+            ProgdfError: there are none, or several sources of them.
+        """
+        work = self._store.get()
+        path = self._documents.get().path
+        if work.transient.viewpoints:
+            self._store.replace(with_transient(work, viewpoints=()))
+            return
+        if path is None:
+            raise ProgdfError("this scene has no folder; drop the file of its cameras on the window")
+        folder = camera_search_folder(path)
+        beside = path.with_name(f"{path.stem}{exports.CAMERAS}")
+        source = beside if beside.is_file() else folder
+        self._show_cameras(load_cameras(source, self._documents.get().scene.origin), folder)
+
+    def _show_cameras(self, cameras: Sequence[Camera], folder: Path) -> None:
+        work = self._store.get()
+        shown = viewpoints(cameras, folder, work.view.camera, self._documents.get().bounds)
+        self._store.replace(with_transient(work, viewpoints=shown))
+        self._store.wake()
 
     def open(self, path: Path) -> None:
         """Place a picture with transparency as a decal; edit the scene by any other picture.
