@@ -264,14 +264,20 @@ def _opacity_course(
 
 def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     """Return the scene after all steps, without removed rows, and with copies at the end."""
-    everything = torch.arange(len(scene))
-    bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
-    rows = _rows_at(scene, everything, steps, bands, 1.0)
-    mask = torch.ones(len(scene), dtype=torch.bool)
+    moved = torch.zeros(len(scene), dtype=torch.bool)
+    remains = torch.ones(len(scene), dtype=torch.bool)
     for step in steps:
+        if step.does in ("transform", "pull"):
+            moved[step.region.members] = True
         if step.does == "remove":
-            mask[step.region.members] = False
-    remaining = scene.replace_rows(everything, rows)[mask]
+            remains[step.region.members] = False
+    remaining = scene
+    members = moved.nonzero()[:, 0]
+    if len(members):  # only these rows are packed, because a pack of a large scene is several times its size
+        bands = scene.sh_degree > 0 and any(_rotates(step) for step in steps)
+        remaining = scene.replace_rows(members, _rows_at(scene, members, steps, bands, 1.0))
+    if not bool(remains.all()):
+        remaining = remaining[remains]
     added = _copies(scene, steps)
     return remaining if added is None else concatenate([remaining, added])
 
