@@ -10,7 +10,7 @@ from trainer.paper.losses import Exponent, Over
 
 
 class PrintedSharpness(Objective):
-    """Loss with the paper's L_render in place of the hinge."""
+    """Loss with the paper's L_render."""
 
     def terms(self, moment: Moment) -> dict[str, Tensor]:
         """See `Objective.terms`."""

@@ -20,13 +20,12 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from trainer.editors import editor_row
 from trainer.optimize.groups import GROUP_STEPS
-from trainer.optimize.losses import SHARPNESS_WEIGHT, laplacian
 from trainer.optimize.pgs import LEARNING_RATES
 from trainer.optimize.retime import resolve_slider
 from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, Preset, TrainOptions
 from trainer.paper import losses as paper_losses
 from trainer.paper.descent import RATE_FACTORS, RATES_3DGS
-from trainer.paper.losses import Exponent, Over
+from trainer.paper.losses import Exponent, Over, laplacian
 from trainer.resolve import resolve_kind
 
 from .objectives import PrintedSharpness, ProgressiveDecay, ProgressiveGrowth, ProgressiveSum
@@ -139,7 +138,6 @@ def _reading(name: str, what: str, path: str, value: object, of: str = PAPER_PGS
 
 _ALL_3DGS = dict.fromkeys(LEARNING_RATES, RATES_3DGS)
 _NO_FACTORS = dict.fromkeys(RATE_FACTORS, 1.0)
-_SHARP_ALWAYS = dict.fromkeys(LEARNING_RATES, SHARPNESS_WEIGHT["style"])
 
 
 def _signed(image: Tensor) -> Tensor:
@@ -196,10 +194,6 @@ VARIANTS = (
         patches=_PLAIN_CLAMPS,
     ),
     _other("no-lpips", "L1 only", "perceptual_weight", 0.0, DESCENT),
-    _descended("sharpness-off", "no L_render", "losses.SHARPNESS_WEIGHT", {}),
-    _descended(
-        "sharpness-hinge", "L_render: as sharp as the target", "losses.SHARPNESS_WEIGHT", _SHARP_ALWAYS
-    ),
     _descended("sharpness-paper", "L_render of the paper", "pgs.Objective", PrintedSharpness),
     _descended("progressive-growth", "the constraint tightening", "pgs.Objective", ProgressiveGrowth),
     _descended("progressive-decay", "the constraint loosening", "pgs.Objective", ProgressiveDecay),
@@ -265,7 +259,6 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
         *(() if equalized else (EQUAL,)),
         *(() if sh_degree > 0 else ("no-sh", "with-sh")),
         *(("no-interpolation", "no-sizing") if kind == "geometry" else ("no-groups",)),
-        *(("sharpness-hinge",) if kind in SHARPNESS_WEIGHT else ("sharpness-off",)),
     }
     seen: list[Resolved] = []
     found = []

@@ -26,7 +26,7 @@ from progdf.scene.bounds import scene_sphere
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
-from trainer.optimize.losses import Objective, erode, perceptual_loss
+from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import TargetStage, learning_rates, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.resolve import resolve, resolve_kind
@@ -165,8 +165,7 @@ def _train(
         extent = groups.extent
     rates = learning_rates(approach.kind, original.shape[1], extent)
     settings = pgs_settings(optimization, rates, 1)
-    inside = [erode(crop(view.mask, view.box)) for view in setup.train]
-    objective = Objective(perceptual_loss()[0], optimization, inside)
+    objective = Objective(perceptual_loss()[0], optimization)
     *_, last = optimize(original, crops, probe_views(setup), stages, objective, settings)
     return last.offsets
 

@@ -72,13 +72,12 @@ def _names(options: TrainOptions, *about: object) -> set[str]:
 def test_ablation_lists_only_variants_that_change_the_run(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color
-    assert not {"sharpness-off", "slider-even", "no-groups"} & color
+    assert not {"slider-even", "no-groups"} & color
     descended = _names(with_values(options, perceptual_weight=0.1), "color", 4, 1)
     assert "no-lpips" in descended
     assert not {"descent", "descent-one-target", "descent-plain-clamps"} & descended, "it descends anyway"
     style = _names(options, "style", 4, 1)
-    assert "sharpness-off" in style
-    assert not {"sharpness-hinge"} & style
+    assert "sharpness-paper" in style
     geometry = _names(options, "geometry", 4, 1)
     assert "no-groups" in geometry
     assert not {"no-sizing", "no-interpolation"} & geometry
@@ -149,8 +148,8 @@ def test_unknown_and_ineffective_variants_have_separate_errors(options: TrainOpt
     assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
         choose_variants(variants, "base,warmup")
-    with pytest.raises(ProgdfError, match="'sharpness-off' makes no difference to this run; "):
-        choose_variants(variants, "sharpness-off")
+    with pytest.raises(ProgdfError, match="'no-groups' makes no difference to this run; "):
+        choose_variants(variants, "no-groups")
     with pytest.raises(ProgdfError, match="--only ' ,' names no variant; choose of base,"):
         choose_variants(variants, " ,")
 

@@ -1,4 +1,4 @@
-"""Loss terms of the descent view by view: L1, a perceptual term and sharpness.
+"""Loss terms of the descent view by view: L1 and a perceptual term.
 
 L_edit of ProGDF (AAAI 2025, eq. 4) is L1 + LPIPS between render and edited view (weights: docs/method.md 3).
 """
@@ -12,13 +12,11 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import avg_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips
-from trainer.options import Kind, OptimizeOptions
-
-_LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
+from trainer.options import OptimizeOptions
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
@@ -110,40 +108,6 @@ def perceptual_loss() -> tuple[Perceptual, str]:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
 
-def sharpness(image: Tensor, target: Tensor, inside: Tensor | None = None) -> Tensor:
-    """Return the sharpness that the render lacks: max(0, S(target) − S(image)). []
-
-    S is the mean of |∇²Y| inside the region, and Y the luma.
-
-    Args:
-        image: the render. [h,w,3]
-        target: its target. [h,w,3]
-        inside: pixels that count; None: all. [h,w] bool
-    """
-    weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
-    count = weights.sum().clamp_min(1.0)
-
-    def edges(picture: Tensor) -> Tensor:
-        return (laplacian(picture @ picture.new_tensor(_LUMA)).abs() * weights).sum() / count
-
-    return (edges(target) - edges(image)).clamp_min(0.0)
-
-
-def laplacian(luma: Tensor) -> Tensor:
-    """Return the 4-neighbor Laplacian without the border pixels. [h,w] -> [h-2,w-2]"""
-    around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
-    return around - 4.0 * luma[1:-1, 1:-1]
-
-
-def erode(mask: Tensor, by: int = 2) -> Tensor:
-    """Return the mask without a border of `by` pixels.
-
-    Pixels beyond the picture count as inside. [h,w] -> [h,w] bool
-    """
-    outside = (mask <= 0.5).float()
-    return max_pool2d(outside[None, None], 2 * by + 1, 1, by)[0, 0] < 0.5
-
-
 Losses = Mapping[str, Sequence[float | None]]
 """Columns of equal length with one row per recording: "step", "left" and the mean of each term, or None.
 
@@ -153,8 +117,6 @@ A term is None in recordings whose steps did not compute it.
 
 PERCEPTUAL_EVERY = 2
 """Interval between evaluations of LPIPS, in steps."""
-SHARPNESS_WEIGHT: Mapping[Kind, float] = {"style": 0.1}
-"""Weight of the sharpness term by kind of edit; other kinds have no such term."""
 
 
 def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
@@ -169,8 +131,6 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
     terms = ["L1"]
     if options.perceptual_weight:
         terms.append(f"{options.perceptual_weight:g} {perceptual} every {PERCEPTUAL_EVERY} steps")
-    if options.kind in SHARPNESS_WEIGHT:
-        terms.append(f"{SHARPNESS_WEIGHT[options.kind]:g} sharpness (hinge)")
     return " + ".join(terms)
 
 
@@ -194,16 +154,11 @@ class Objective:
     Args:
         perceptual: distance whose targets are cached until the stage ends
         options: terms and their weights relative to an L1 of 1, fully resolved
-        inside: per training view, the region in its box without its border; sharpness is measured there.
-            None: in the whole box. [h,w] bool each
     """
 
-    def __init__(
-        self, perceptual: Perceptual, options: OptimizeOptions, inside: Sequence[Tensor] | None = None
-    ) -> None:
+    def __init__(self, perceptual: Perceptual, options: OptimizeOptions) -> None:
         self._options = options
         self._perceptual = perceptual
-        self._inside = inside
 
     def begin_stage(self) -> None:
         """Clear the cache, because the targets change."""
@@ -216,10 +171,6 @@ class Objective:
         if options.perceptual_weight and moment.arrived and moment.local % PERCEPTUAL_EVERY == 0:
             distance = self._perceptual(moment.image, moment.target, moment.view)
             terms["perceptual"] = options.perceptual_weight * distance
-        if options.kind in SHARPNESS_WEIGHT:
-            inside = self._inside[moment.view] if self._inside is not None else None
-            lost = sharpness(moment.image, moment.target, inside)
-            terms["sharpness"] = SHARPNESS_WEIGHT[options.kind] * lost
         return terms
 
 

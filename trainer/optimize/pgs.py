@@ -28,9 +28,8 @@ from trainer.store.state import Saved, generator
 from trainer.views.boxes import probe_views
 from trainer.views.crops import CropScene, render_all
 from trainer.views.setup import TrainingSetup
-from trainer.views.view import crop
 
-from .losses import Moment, Objective, Perceptual, TermMeans, erode, l1, total_loss
+from .losses import Moment, Objective, Perceptual, TermMeans, l1, total_loss
 
 EPSILON = 0.1
 """Raised ε of Adam, as a share of the root mean square of an attribute's gradient."""
@@ -348,14 +347,12 @@ def descend(task: DescentTask, state: PgsState, on_step: OnStep) -> Iterator[Par
     # added rows have their stage's opacity from its first step, which a blended target contradicts
     if task.adds_rows:
         settings = replace(settings, ramp=0.0)
-    device = task.original.device
-    inside = [erode(crop(view.mask, view.box)).to(device) for view in task.setup.train]
     return optimize(
         task.original,
         task.crops,
         probe_views(task.setup, engine=options.engine),
         task.stages,
-        Objective(task.perceptual, options, inside),
+        Objective(task.perceptual, options),
         settings,
         on_step=on_step,
         state=state,

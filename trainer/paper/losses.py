@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from trainer.optimize.losses import Moment, Perceptual, l1, laplacian
+from trainer.optimize.losses import Moment, Perceptual, l1
 from trainer.options import OptimizeOptions
 from trainer.views.crops import CropScene
 
@@ -51,6 +51,12 @@ def progressive_change(moved: Tensor, previous: Tensor, step: int, exponent: Exp
     factor: float = _ALPHA * _BETA ** (signed_step / _PERIOD_STEPS)
     change = (moved - previous.detach()).square().sum()
     return factor * (change / len(moved) if over == "mean" else change)
+
+
+def laplacian(luma: Tensor) -> Tensor:
+    """Return the 4-neighbor Laplacian without the border pixels. [h,w] -> [h-2,w-2]"""
+    around = luma[:-2, 1:-1] + luma[2:, 1:-1] + luma[1:-1, :-2] + luma[1:-1, 2:]
+    return around - 4.0 * luma[1:-1, 1:-1]
 
 
 def sharpness(image: Tensor) -> Tensor:

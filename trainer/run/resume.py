@@ -26,7 +26,7 @@ from trainer.options import MAX_THREADS, ReportLevel, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
-_VERSION = 8  # version of the saved state; 8: with few pictures, training decides whether to carry on the map
+_VERSION = 9  # version of the saved state; 9: the loss of a style has no term for sharpness
 # environment variables that select the kernels of numba and of the linear algebra libraries
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",

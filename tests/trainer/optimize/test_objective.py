@@ -18,10 +18,8 @@ from trainer.optimize.losses import (
     Objective,
     TermMeans,
     describe_loss,
-    erode,
     l1,
     loss_table,
-    sharpness,
     total_loss,
 )
 from trainer.options import OptimizeOptions
@@ -45,7 +43,7 @@ def paying(perceptual_weight: float = 0.1, **more: object) -> OptimizeOptions:
     return replace(OptimizeOptions(), perceptual_weight=perceptual_weight, **more)  # type: ignore[arg-type]
 
 
-ALL_TERMS = paying(0.3, kind="style")
+ALL_TERMS = paying(0.3)
 
 
 # ---- gradients
@@ -56,14 +54,6 @@ def test_l1_and_gradient_l1_match_finite_differences() -> None:
     target = noise(8, 9, 3, seed=1)
     for measure in (l1, GradientL1()):
         assert torch.autograd.gradcheck(lambda x, measure=measure: measure(x, target), image)
-
-
-def test_sharpness_gradient_matches_finite_differences() -> None:
-    image = 0.5 * noise(8, 9, 3)
-    target = noise(8, 9, 3, seed=1)
-    inside = noise(8, 9, seed=3) > 0.3
-    assert float(sharpness(image, target, inside)) > 0, "the hinge is open"
-    assert torch.autograd.gradcheck(lambda x: sharpness(x, target, inside), image.requires_grad_())
 
 
 def test_lpips_gradient_matches_finite_differences() -> None:
@@ -92,14 +82,13 @@ def test_lpips_gradient_matches_finite_differences() -> None:
 
 def test_loss_is_the_sum_of_its_named_terms() -> None:
     terms = Objective(GradientL1(), ALL_TERMS).terms(moment())
-    assert list(terms) == ["l1", "perceptual", "sharpness"]
+    assert list(terms) == ["l1", "perceptual"]
     assert float(total_loss(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
 
 
-def test_weights_scale_their_terms_and_leave_l1_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_scale_their_terms_and_leave_l1_unchanged() -> None:
     now = moment(image=0.5 * noise(8, 9, 3))
     single = Objective(GradientL1(), ALL_TERMS).terms(now)
-    monkeypatch.setattr("trainer.optimize.losses.SHARPNESS_WEIGHT", {"style": 0.2})
     double = Objective(GradientL1(), replace(ALL_TERMS, perceptual_weight=0.6)).terms(now)
     for name, value in single.items():
         assert float(value.detach()) > 0
@@ -127,51 +116,7 @@ def test_new_stage_forgets_the_targets_of_the_last() -> None:
 
 def test_loss_description_names_the_active_terms() -> None:
     assert describe_loss(paying(), "gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
-    assert describe_loss(ALL_TERMS, "lpips-vgg") == (
-        "L1 + 0.3 lpips-vgg every 2 steps + 0.1 sharpness (hinge)"
-    )
-
-
-# ---- sharpness
-
-
-def test_hinge_is_zero_if_the_render_is_as_sharp_as_its_target() -> None:
-    texture = noise(20, 20, 3)
-    soft = texture.mean(dim=(0, 1)).expand_as(texture)
-    assert float(sharpness(texture, texture)) == 0.0
-    assert float(sharpness(texture, soft)) == 0.0
-    assert float(sharpness(soft, texture)) > 0.1
-
-
-def test_hinge_covers_only_the_mask() -> None:
-    texture = noise(20, 20, 3)
-    soft = texture.clone()
-    soft[:, 10:] = 0.5
-    left = torch.zeros(20, 20, dtype=torch.bool)
-    left[:, :8] = True
-    assert float(sharpness(soft, texture, left)) == 0.0
-    assert float(sharpness(soft, texture, ~left)) > 0.0
-
-
-def test_descending_the_hinge_restores_lost_sharpness() -> None:
-    target = noise(24, 24, 3)
-    image = (0.25 * target + 0.75 * target.mean()).requires_grad_()
-    optimizer = torch.optim.SGD([image], lr=20.0)
-    before = float(sharpness(image, target).detach())
-    for _ in range(40):
-        optimizer.zero_grad()
-        loss = sharpness(image, target)
-        loss.backward()
-        optimizer.step()
-    assert float(sharpness(image, target).detach()) < 0.1 * before
-
-
-def test_erosion_shrinks_the_mask_except_at_the_picture_border() -> None:
-    mask = torch.zeros(12, 12)
-    mask[3:, 3:] = 1.0
-    inner = erode(mask, by=2)
-    assert bool(inner[5:, 5:].all())
-    assert int(inner.sum()) == 49
+    assert describe_loss(ALL_TERMS, "lpips-vgg") == "L1 + 0.3 lpips-vgg every 2 steps"
 
 
 # ---- means
