@@ -285,7 +285,7 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
         )
         lab = srgb_to_oklab(fit_gamut(shifted))
     value = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
-    lab = _exposed(lab, value)
+    lab = _expose_tones(lab, value)
     lightness = lab[..., 0].clamp(0, 1)
     ab = tone.balance_white(lab[..., 1:], lightness, value["temperature"], value["tint"])
     steeper = tone.contrast(lightness, value["contrast"]) if value["contrast"] else lightness
@@ -312,7 +312,7 @@ _TONES: Mapping[str, Callable[[Tensor, float], Tensor]] = {
 """Controls of lightness before the exposure, in their order."""
 
 
-def _exposed(lab: Tensor, value: Mapping[str, float]) -> Tensor:
+def _expose_tones(lab: Tensor, value: Mapping[str, float]) -> Tensor:
     """Apply the controls of `_TONES` and the exposure; lightness may leave 0 to 1. [...,3] -> [...,3]"""
     before = lab[..., 0]
     lightness = before

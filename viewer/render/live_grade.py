@@ -58,7 +58,7 @@ BLACK_MARK = (0.15, 0.35, 1.0)
 """Color of clipped black in the picture, sRGB."""
 
 
-def clipped(colors: Tensor) -> tuple[Tensor, Tensor]:
+def clipped_colors(colors: Tensor) -> tuple[Tensor, Tensor]:
     """Return where colors are clipped: a channel at 255, or all channels at 0. [...,3] -> [...], [...]"""
     half_level = 0.5 / 255
     return colors.amax(dim=-1) > 1.0 - half_level, colors.amax(dim=-1) < half_level
@@ -78,7 +78,7 @@ class ColorTable:
         if len(colors) > SIDE**3:
             self._points = used_points(self._inside)
 
-    def graded(self, live: LiveGrade) -> Tensor:
+    def apply(self, live: LiveGrade) -> Tensor:
         """Return the colors after the grade: exact for few, from the lattice for many. [M,3]"""
         if self._points is None:
             graded = _at_strength(self._inside, live)
@@ -87,7 +87,7 @@ class ColorTable:
             table[self._points] = _at_strength(table[self._points], live)
             graded = look_up(self._inside.T, table).T
         if live.marks:
-            white, black = clipped(graded)
+            white, black = clipped_colors(graded)
             graded = graded.clone()
             graded[white] = graded.new_tensor(WHITE_MARK)
             graded[black] = graded.new_tensor(BLACK_MARK)
@@ -135,7 +135,7 @@ class LiveColors:
             self._table = ColorTable(drawn_colors(scene, rows, position))
             self._key = key
         before = self._table.colors
-        after = self._table.graded(live)
+        after = self._table.apply(live)
         change = (after - before) / C0
         change[(after <= 0.0) & (before <= 0.0)] = 0.0
         sh0 = scene.sh0.clone()
@@ -195,7 +195,7 @@ class FormGrader:
         bins = (values * BINS).long().clamp(0, BINS - 1)
         counts = torch.stack([torch.bincount(bins[:, i], weights, BINS) for i in range(4)])
         tallest = counts[:, 1:-1].max().clamp_min(1e-9)
-        white, black = clipped(colors)
+        white, black = clipped_colors(colors)
         total = weights.sum().clamp_min(1e-9)
         return GradeScope(
             tuple(tuple(row) for row in (counts / tallest).clamp(0.0, 1.0).tolist()),

@@ -71,9 +71,9 @@ def test_live_grade_is_exact_in_the_current_view() -> None:
 def test_lattice_of_used_points_equals_the_whole_lattice(monkeypatch: pytest.MonkeyPatch) -> None:
     colors = torch.rand(3000, 3, generator=torch.Generator().manual_seed(1)) ** 2
     live = LiveGrade(np.arange(len(colors)), GRADE)
-    exact = ColorTable(colors).graded(live)
+    exact = ColorTable(colors).apply(live)
     monkeypatch.setattr(live_grade, "SIDE", 9)
-    few = ColorTable(colors).graded(live)
+    few = ColorTable(colors).apply(live)
     table = grade_fully(lattice_colors(9).float(), GRADE)
     assert torch.allclose(few, live_grade.look_up(colors.T, table).T, atol=1e-6)
     assert (few - exact).abs().mean() < 0.02
@@ -101,7 +101,7 @@ def test_engine_shows_the_live_grade_and_returns_to_the_scene() -> None:
 
 def test_clipped_colors_are_marked_and_counted() -> None:
     colors = torch.tensor([[1.0, 0.5, 0.2], [0.0, 0.0, 0.0], [0.4, 0.5, 0.6], [0.2, 0.0, 0.3]]).repeat(4, 1)
-    marked = ColorTable(colors).graded(LiveGrade(np.arange(16), ColorGrade(), marks=True))
+    marked = ColorTable(colors).apply(LiveGrade(np.arange(16), ColorGrade(), marks=True))
     assert marked[0].tolist() == pytest.approx(WHITE_MARK)
     assert marked[1].tolist() == pytest.approx(BLACK_MARK)
     assert torch.equal(marked[2:4], colors[2:4])

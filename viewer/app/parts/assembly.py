@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from viewer.app.grading import GradePreview
 from viewer.app.main_view import MainView
 from viewer.app.messages import Requests, WaitFor
 from viewer.files import exports
@@ -140,13 +139,7 @@ def make_parts(
         context=main_view.context,
         picture_size=picture_size,
         save_edited=main_view.save_edited,
-        grading=GradePreview(
-            store=store,
-            documents=documents,
-            messages=messages,
-            context=main_view.context,
-            engine=lambda: main_view.engine,
-        ),
+        engine=lambda: main_view.engine,
     )
     jobs = JobActions(
         store=store,
@@ -184,10 +177,6 @@ def make_parts(
         tidy=TidyActions(store=store, documents=documents, maker=maker, engine=lambda: main_view.engine),
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
         pulling=PullActions(
-            store=store,
-            documents=documents,
-            maker=maker,
-            engine=lambda: main_view.engine,
-            wake=wake_window,
+            store=store, documents=documents, maker=maker, engine=lambda: main_view.engine, wake=wake_window
         ),
     )

@@ -29,6 +29,7 @@ from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.jobs import consent, training
 from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
+from viewer.render.engine import ViewEngine
 from viewer.state.commands import Plain
 from viewer.state.forms import (
     EDITORS,
@@ -94,7 +95,7 @@ class PreviewActions:
         context: the GL context
         picture_size: returns width and height of the picture on screen, in pixels
         save_edited: writes the picture on screen with its visible layers into a folder; returns its path
-        grading: the form's grade on the scene
+        engine: returns the engine that draws the window
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class PreviewActions:
         context: moderngl.Context,
         picture_size: Callable[[], tuple[int, int]],
         save_edited: Callable[[Path, str], Path],
-        grading: GradePreview,
+        engine: Callable[[], ViewEngine],
     ) -> None:
         self._store = store
         self._documents = documents
@@ -114,7 +115,9 @@ class PreviewActions:
         self._context = context
         self._picture_size = picture_size
         self._save_edited = save_edited
-        self._grading = grading
+        self._grading = GradePreview(
+            store=store, documents=documents, messages=messages, context=context, engine=engine
+        )
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: PreviewInputs | None = None
