@@ -7,6 +7,7 @@ or in `DRY_RUNS`, with its reason.
 
 from __future__ import annotations
 
+import contextlib
 import glob
 import importlib.util
 import os
@@ -16,6 +17,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,9 @@ from benchmarks import __main__ as benchmarks
 from progdf.__main__ import COMMANDS, main, run_guarded
 from progdf.camera import Camera
 from progdf.field import neural_fit
+from tests.helpers.comfy_server import comfy_server
 from tests.helpers.documents import Example, command_examples, python_examples
+from tests.helpers.image_server import image_server
 from tests.helpers.null_app import null_platform
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import orbit_camera
@@ -45,6 +49,8 @@ NO_CLUSTER = (
 REFUSALS = {
     "progdf train robot.ply --out runs/batman --region 'text:\"the man\"' "
     "--editor 'instruct:\"turn him into Batman\"'": NO_WEIGHTS,
+    "progdf train robot.ply --out runs/marble --region labels:robot_labels.npy:1 "
+    "--editor 'instruct:\"turn him into a marble statue\"'": NO_WEIGHTS,
     "progdf batch catalogue.toml --out /shared/runs --address HEAD:6379 --dry-run": NO_CLUSTER,
     "progdf batch catalogue.toml --out /shared/runs --address HEAD:6379": NO_CLUSTER,
 }
@@ -82,6 +88,7 @@ NEEDS_RUNS = ("progdf fit", "progdf evaluate", "python -m benchmarks edits", "py
 SLOW = ("progdf train", "progdf demo", "progdf batch", "python", *NEEDS_RUNS)
 
 EXTRAS = {
+    "api": "openai",
     "colmap": "pycolmap",
     "formats": "gaussforge",
     "usd": "pxr",
@@ -102,6 +109,8 @@ def cheap_options(words: list[str]) -> list[str]:
     switches: list[str] = []
     if words[:2] == ["progdf", "train"]:
         options = dict(TRAINING)
+        if "--api-url" in words:
+            options["--edit-size"] = "64"
         if "--preset" in words:
             options["--size"] = "tiny"
     if words[:2] == ["progdf", "demo"]:
@@ -186,6 +195,18 @@ def run_words(words: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     return 0
 
 
+@contextlib.contextmanager
+def with_server(words: list[str]) -> Iterator[list[str]]:
+    """Yield the words with a running server instead of the documented one."""
+    if "--api-url" not in words:
+        yield words
+        return
+    is_comfy = any(word.startswith("comfy:") for word in words)
+    with comfy_server() if is_comfy else image_server() as server:
+        at = words.index("--api-url") + 1
+        yield [*words[:at], server.url, *words[at + 1 :]]
+
+
 def check_example(
     example: Example, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -196,7 +217,9 @@ def check_example(
     if words[:2] == ["progdf", "train"] and "--resume" in words:
         stop_training(words)
     capsys.readouterr()
-    status = run_words(words, monkeypatch)
+    monkeypatch.setenv("PATH", str(Path("programs").absolute()), prepend=os.pathsep)
+    with with_server(words) as served:
+        status = run_words(served, monkeypatch)
     errors = capsys.readouterr().err
     missing = re.search(r"progdf-studio\[(\w+)\]", errors)
     if missing and importlib.util.find_spec(EXTRAS.get(missing[1], "progdf")) is None:

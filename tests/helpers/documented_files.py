@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,6 +93,7 @@ def write_documented_files() -> None:
     _write_pictures(demo)
     _write_session(demo.gaussians)
     Path("catalogue.toml").write_text(CATALOGUE, encoding="utf-8")
+    _write_program()
 
 
 def train_documented_runs() -> None:
@@ -109,6 +111,24 @@ def identity_lattice(side: int = 5) -> torch.Tensor:
     steps = torch.linspace(0.0, 1.0, side)
     blue, green, red = torch.meshgrid(steps, steps, steps, indexing="ij")
     return torch.stack([red, green, blue], dim=-1).reshape(-1, 3)
+
+
+def _write_program() -> None:
+    """Write a stand-in for ImageMagick that turns red, green and blue around by its last number."""
+    program = Path("programs", "magick")
+    program.parent.mkdir()
+    program.write_text(
+        f"#!{sys.executable}\n"
+        "import sys\n"
+        "from PIL import Image\n"
+        "source, _, numbers, target = sys.argv[1:]\n"
+        "picture = Image.open(source).convert('RGB')\n"
+        "red, green, blue = picture.split()\n"
+        "turned = Image.merge('RGB', (green, blue, red))\n"
+        "Image.blend(picture, turned, float(numbers.split(',')[2]) / 100 - 1).save(target)\n",
+        encoding="utf-8",
+    )
+    program.chmod(0o755)
 
 
 def _write_scenes(demo: DemoScene) -> None:
