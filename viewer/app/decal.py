@@ -33,7 +33,7 @@ from viewer.state.transient import Decal, DecalGhost, DecalGrip, Transient
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, u32
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button, plate, small, tip
+from viewer.ui.widgets import accent_button, checkbox, plate, small, tip
 
 _MAX_TEXTURE_PX = 1024  # maximum longer side of the picture shown on screen, pixels
 _INITIAL_SIZE = 0.25  # initial longer side, as a fraction of the view's height
@@ -523,7 +523,7 @@ def _draw_buttons(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces
         imgui.align_text_to_frame_padding()
         imgui.text(size_text(frame))
         imgui.same_line()
-        changed, level = imgui.checkbox("Level", decal.level)
+        level = checkbox("Level", decal.level, pointer.ui)
         tip("Count the angle from the horizontal of the scene. Hold Ctrl while rotating for steps of 15°")
         imgui.same_line()
         if accent_button("Train", (72.0 * scale, 0.0)):
@@ -534,7 +534,7 @@ def _draw_buttons(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces
             request = "put_back"
         words = f"Surface: {decal.surface}" if decal.surface else "Finding the surface …"
         small(words, PALETTE.dim, imgui.calc_text_size(words).x)
-    if changed:
+    if level != decal.level:
         decal = replace(decal, level=level, angle=0.0 if level else decal.angle)
         picture = surfaces.depth(pointer.engine.scene, pointer.camera(pointer.shown.camera), at_once=True)
         if picture is not None:

@@ -211,7 +211,8 @@ def _is_new(kind: str) -> bool:
 
 def _submit(dialog: Dialog, path: str) -> DialogResult:
     """Request the file; the dialog stays open if the file may be rejected."""
-    stays = replace(dialog, text=path, chosen="") if dialog.kind in ("save", *_DELIVERS) else None
+    kept = dialog.kind in ("save", "open", *_DELIVERS)
+    stays = replace(dialog, text=path, chosen="", error="") if kept else None
     return DialogResult(stays, (_submission(dialog, path),))
 
 

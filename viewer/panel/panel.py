@@ -78,6 +78,7 @@ def draw(
         actions: receives the requested actions, see `perform`
     """
     display = imgui.get_io().display_size
+    ui.is_sliding = False
     wide = width(work.layout, ui)
     imgui.set_next_window_pos((display.x - wide, 0.0))
     imgui.set_next_window_size((wide, display.y))

@@ -101,6 +101,7 @@ def draw(
             _anchor(label, mouse, value)  # after the move: a slow frame may contain both
     if not pressed:
         tip_once(help_, ui)
+    ui.is_sliding |= pressed
     color = fill if active else PALETTE.faint
     ticks = ticks if height >= HEIGHT_PX else ()
     _paint((start, top, span), value, ticks, scale, color, hovered or pressed, most)

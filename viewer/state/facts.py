@@ -32,6 +32,7 @@ MAX_COUNTED_MEMBERS = 20_000
 Larger regions are subsampled at a constant stride, so that drawing takes a fraction of a second.
 """
 
+_EMPTY_CONTRAST = 0.05  # a thumbnail with less contrast shows nothing, 0 to 1
 _THUMBNAIL_GRAY = 56  # background of a thumbnail, 0 to 255
 _THUMBNAIL_DISTANCE = 0.7  # camera distance as a share of the framing distance
 
@@ -179,14 +180,14 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
     return red, green, blue
 
 
-def _edited_region(scene: Gaussians, gdf: Gdf) -> Gaussians:
-    """Return the region at full strength, subsampled to at most `MAX_COUNTED_MEMBERS` Gaussians."""
+def _edited_region(scene: Gaussians, gdf: Gdf, strength: float = 1.0) -> Gaussians:
+    """Return the region at a strength, subsampled to at most `MAX_COUNTED_MEMBERS` Gaussians."""
     stride = max(-(-len(gdf.region.members) // MAX_COUNTED_MEMBERS), 1)
     region = scene[gdf.region.members[::stride]]
     edited = dict[str, Any]()
     for name in gdf.field.attributes:
         old: Tensor = getattr(region, name)
-        edited[name] = old + gdf.field.attribute_offsets(name, 1.0)[::stride].reshape(old.shape)
+        edited[name] = old + gdf.field.attribute_offsets(name, strength)[::stride].reshape(old.shape)
     return replace(region, **edited)
 
 
@@ -205,9 +206,21 @@ def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np
         thumbnail_camera = to_camera(
             replace(framed, distance=_THUMBNAIL_DISTANCE * framed.distance), side, side
         )
-        image = render(region, thumbnail_camera, (_THUMBNAIL_GRAY / 255,) * 3).image
+        background = (_THUMBNAIL_GRAY / 255,) * 3
+        image = render(region, thumbnail_camera, background).image
+        if float((image.nan_to_num() - background[0]).abs().max()) < _EMPTY_CONTRAST:
+            image = _struck_out(render(_edited_region(scene, gdf, 0.0), thumbnail_camera, background).image)
     pixels: NDArray[np.uint8] = (image.nan_to_num().clamp(0.0, 1.0) * 255).round().byte().numpy()
     return pixels
+
+
+def _struck_out(image: Tensor) -> Tensor:
+    """Return the thumbnail of a removed region: half of its color, under a diagonal line. [H,W,3]"""
+    faded = torch.lerp(image, torch.full_like(image, _THUMBNAIL_GRAY / 255), 0.5)
+    rows = torch.arange(len(image))
+    for shift in (-1, 0, 1):
+        faded[rows, (len(image) - 1 - rows + shift).clamp(0, len(image) - 1)] = 0.9
+    return faded
 
 
 def describe_loaded(gdf: Gdf) -> str:

@@ -334,6 +334,19 @@ def with_editor(form: NewEdit, editor: int) -> NewEdit:
     return replace(form, editor=editor, region=region, error="")
 
 
+def without_values(form: NewEdit) -> NewEdit:
+    """Return the form for the next edit: region, editor and quality stay, the values of the edit do not."""
+    return NewEdit(
+        region=form.region,
+        typed_region=form.typed_region,
+        editor=form.editor,
+        model=form.model,
+        outside=form.outside,
+        quick=form.quick,
+        preview=form.preview,
+    )
+
+
 def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
     """Return the form with the editor and the settings of an edit; None if the form has no such editor.
 

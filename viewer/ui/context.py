@@ -140,6 +140,7 @@ class UiContext:
         self.context.config_nav_windowing_key_next = self.context.config_nav_windowing_key_prev = 0
         self.keyboard = ""  # part of the window with the keyboard, "" for the picture
         self.focused = ""  # part that received the keyboard last
+        self.is_sliding = False  # a strength slider of the panel is dragged
         self.known_tips: dict[str, int] = {}  # tooltips shown once per session, and their last frame
         self.fonts = _load_fonts(io.fonts)
         self.scale = 0.0

@@ -23,6 +23,7 @@ T = TypeVar("T")
 MenuItems = Sequence[str | tuple[str, Action | None, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
 LINE_PX = 300.0  # width of the small text in a list's entry, at 1×
+MOVING_OPACITY = 0.6  # of the plates over the picture while a slider moves
 _GRIP_PX = 4.0  # a press that moves no further is a click, at 1×
 
 
@@ -123,8 +124,10 @@ def plate(
     imgui.set_next_window_pos(at, 0, pivot)
     imgui.set_next_window_size(size or (0.0, 0.0))
     imgui.push_style_color(imgui.Col_.window_bg, PALETTE.scrim)
+    alpha = imgui.get_style().alpha * (MOVING_OPACITY if ui.is_sliding else 1.0)
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 4.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, (pad * ui.scale, pad * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.alpha, alpha)
     fits = imgui.WindowFlags_.always_auto_resize.value if size is None else 0
     imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits | ui.nav_flags(name))
     imgui.pop_style_var(2)
@@ -132,6 +135,7 @@ def plate(
     ui.take_keyboard(name)
     yield  # after an exception, `UiContext.guard` closes the open items
     imgui.end()
+    imgui.pop_style_var()
 
 
 def accent_button(text: str, size: imgui.ImVec2Like, chord: str = "") -> bool:
@@ -162,6 +166,16 @@ def tip_once(text: str, ui: UiContext) -> None:
     frame = imgui.get_frame_count()
     if frame - ui.known_tips.get(text, frame) <= 1 and show_tip(text):
         ui.known_tips[text] = frame
+
+
+def checkbox(text: str, on: bool, ui: UiContext) -> bool:
+    """Draw a check box, with an outline that shows it on any background; return its state."""
+    imgui.push_style_var(imgui.StyleVar_.frame_border_size, ui.scale)
+    imgui.push_style_color(imgui.Col_.border, PALETTE.faint)
+    on = bool(imgui.checkbox(text, on)[1])
+    imgui.pop_style_color()
+    imgui.pop_style_var()
+    return on
 
 
 def icon_button(
@@ -450,8 +464,8 @@ def value_slider(
     """Draw a field with its value as text and a bar along its lower edge; return the value.
 
     Ctrl+click opens a text field, a double click resets to `default`, and arrow keys move a focused field. A
-    range with a positive lower end is logarithmic. A new value is rounded to two decimals. `wide`: window
-    pixels, 0 for the rest of the line.
+    range with a positive lower end is logarithmic. The bar of a range with negative values starts at 0. A new
+    value is rounded to two decimals. `wide`: window pixels, 0 for the rest of the line.
     """
     logarithmic = ends[0] > 0.0
     context = imgui.get_current_context()
@@ -486,9 +500,10 @@ def value_slider(
     left = (low.x, high.y - 3.0 * ui.scale)
     end = (high.x, high.y)
     canvas = imgui.get_window_draw_list()
-    filled_end = (low.x + share * (high.x - low.x), high.y)
     canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)
-    canvas.add_rect_filled(left, filled_end, u32(PALETTE.accent), 2.0 * ui.scale)
+    start = min(max(-first / (last - first), 0.0), 1.0) if ends[0] < 0.0 else 0.0
+    span = (low.x + min(start, share) * (high.x - low.x), low.x + max(start, share) * (high.x - low.x))
+    canvas.add_rect_filled((span[0], left[1]), (span[1], high.y), u32(PALETTE.accent), 2.0 * ui.scale)
     return round(new, 2) if changed else value  # imgui would round an unchanged value to float32
 
 

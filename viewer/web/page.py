@@ -79,6 +79,12 @@ class PageTexts:
         return f":root, :host {{ --behind: {hex_color(self.background)}; }}\n{_source('page.css')}"
 
     @property
+    def shade(self) -> str:
+        """Class of the panel's colors, "dark" before a background darker than middle gray."""
+        red, green, blue = self.background
+        return "dark" if 0.2126 * red + 0.7152 * green + 0.0722 * blue < 0.5 else "light"
+
+    @property
     def body(self) -> str:
         """Elements that the script fills."""
         picture = io.BytesIO()
@@ -100,6 +106,7 @@ def build_page(container: bytes, texts: PageTexts) -> str:
     parts = {
         "title": html.escape(texts.title),
         "version": __version__,
+        "shade": texts.shade,
         "style": style,
         "style_hash": _hash(style),
         "body": texts.body,

@@ -112,6 +112,25 @@ def test_typed_path_is_opened(window: application.App, saved: Path) -> None:
 
 
 @pytest.mark.gl
+def test_wrong_path_stays_in_the_open_dialog(window: application.App, saved: Path) -> None:
+    window.handle(Plain("open"))
+    window.handle(WithText("open_file", "/nowhere/at all.ply"))
+    assert question(window).text == "/nowhere/at all.ply"
+    assert "at all.ply" in question(window).error
+    window.handle(WithText("open_file", str(saved)))
+    assert window.main_view.work.dialog is None
+    assert window.parts.file_actions.path == saved
+
+
+@pytest.mark.gl
+def test_background_of_a_session_ends_with_it(window: application.App, folder: Path, saved: Path) -> None:
+    window.parts.file_actions.open(saved)
+    assert window.main_view.work.view.background != (1.0, 1.0, 1.0)
+    window.parts.file_actions.open(folder / "bear.ply")
+    assert window.main_view.work.view.background == (1.0, 1.0, 1.0)
+
+
+@pytest.mark.gl
 def test_quitting_asks_only_with_unsaved_changes(window: application.App, folder: Path) -> None:
     press(window, "Ctrl+Q")
     assert window.is_closed

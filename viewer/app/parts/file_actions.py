@@ -105,7 +105,7 @@ class FileActions:
             "open": lambda _: ask(Dialog("open")),
             "decal": lambda _: ask(Dialog("open", notice="A picture to place on a surface")),
             "browse": self._browse,
-            "open_file": lambda path: self.open(parse_path(path)),
+            "open_file": self._open_typed,
             "camera": lambda _: self._pictures.keep_camera(self.path),
             "discard": self._discard,
             "restore_autosave": lambda path: self.open(Path(path)),
@@ -160,13 +160,17 @@ class FileActions:
         Scenes and sessions replace everything, an edit becomes the top layer, a camera moves the view, and an
         edited picture goes into the form of a new edit.
         """
+        attempt(self._messages, lambda: self._open_any(path))
 
-        def open_kind() -> None:
-            file = unpack_bundle(path) if path.name.endswith(BUNDLE) else path
-            picture = file.suffix.lower() in ENDINGS
-            self._open(file, "picture" if picture else kind_of(file))
-
-        attempt(self._messages, open_kind)
+    def _open_typed(self, path: str) -> None:
+        """Open a file; after a failure, its path stays in an open dialog, with the reason."""
+        dialog = self._store.get().dialog
+        if dialog is None or dialog.kind != "open":
+            self.open(parse_path(path))
+            return
+        self._store.replace(replace(self._store.get(), dialog=None))
+        if error := failure_line(lambda: self._open_any(parse_path(path))):
+            self._messages.ask(replace(dialog, text=path, error=error))
 
     def save(self, path: Path) -> None:
         """Save the session to `path`, which becomes its file.
@@ -230,6 +234,11 @@ class FileActions:
         self._browser.close()
         self._claim.release()
         self.session_autosave.release()
+
+    def _open_any(self, path: Path) -> None:
+        file = unpack_bundle(path) if path.name.endswith(BUNDLE) else path
+        picture = file.suffix.lower() in ENDINGS
+        self._open(file, "picture" if picture else kind_of(file))
 
     def _open(self, path: Path, kind: str) -> None:
         if self._documents.get().is_empty and kind in ("picture", "cameras", "gdf"):
@@ -311,7 +320,10 @@ class FileActions:
             return opened, first_camera(opened.scene, up=up, stored=opened.stored_camera)
 
         opened, camera = self._wait_for(load, f"Opening {path.name} …")
-        self._open_document(opened, on_another_scene(self._store.get().view, camera), ())
+        view = on_another_scene(self._store.get().view, camera)
+        if self.path is not None:  # the background of a session, such as an example, ends with it
+            view = replace(view, background=ViewState.background)
+        self._open_document(opened, view, ())
         self.session_autosave.drop()
         self.path = None
         self.offer_autosave()

@@ -28,7 +28,7 @@ from viewer.jobs import consent, training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import OnItem, Plain
-from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit
+from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit, without_values
 from viewer.state.selection import (
     SUFFIX,
     NamedRegion,
@@ -327,7 +327,7 @@ class JobActions:
             self._messages.ask(Dialog("allow", action, then=Plain("train")))
             return
         error = form.obstacle or failure_line(lambda: self._enqueue(form))
-        form = replace(form, error=error) if error else replace(form, error="", name="")
+        form = replace(form, error=error) if error else without_values(form)
         self._store.replace(replace(self._store.get(), form=form, form_open=bool(error)))
         self._store.wake()
 

@@ -16,7 +16,7 @@ from viewer.camera.view_camera import Vec3, axes
 from viewer.state.transient import Pull, PullDrag
 from viewer.ui.context import PALETTE, Rgba, UiContext, u32
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button, elide, group_digits, inert, plate, small, tip
+from viewer.ui.widgets import accent_button, checkbox, elide, group_digits, inert, plate, small, tip
 
 from .cutting import clear
 from .ring import surface_ring
@@ -55,15 +55,15 @@ def draw_bar(pull: Pull, pointer: PointerContext) -> tuple[Pull, str]:
         imgui.align_text_to_frame_padding()
         imgui.text(_title(pull, pointer))
         _follow_box("Whole part", pointer)
-        whole = imgui.checkbox("Whole part", pull.whole)[1]
+        whole = checkbox("Whole part", pull.whole, pointer.ui)
         tip("Move all that is connected, except pins and what is held; else only what lies in the radius")
         holds = pull.holds_selection
         if pointer.shown.selection.count:
             _follow_box("Hold selection", pointer)
-            holds = imgui.checkbox("Hold selection", holds)[1]
+            holds = checkbox("Hold selection", holds, pointer.ui)
             tip("Keep the selection in place; else only the selection moves")
         _follow_box("Cut", pointer)
-        cuts = imgui.checkbox("Cut", pull.is_cutting)[1]
+        cuts = checkbox("Cut", pull.is_cutting, pointer.ui)
         tip("Draw lines where things touch, so that only one of them moves (K)")
         if pull.pose.cuts:
             _follow_box("Clear cuts", pointer)
