@@ -41,7 +41,9 @@ from .layers import (
     color_factors,
     disc_changes,
     effects_of,
+    is_averaged_alone,
     needs_split,
+    rule_of,
 )
 from .overlap import ARRANGED, find_paint
 from .paint_order import PaintOrder
@@ -288,8 +290,8 @@ class Composer:
         if not len(rows) or not names:
             return 0.0
         active = [layer for _, layer in stack]
-        if blend == "adjust" and self._maps_others(stack):
-            return self._write_adjusted(active, rows, names)
+        if self._maps_others(stack, blend) or is_averaged_alone(active, blend):
+            return self._write_plainly(active, blend, rows, names)
         parts = [self._part(members, edit, layer) for edit, layer in stack if edit in members.parts]
         for edit in {part.edit for part in parts if needs_split(part.layer)}:
             self._split_of(edit)  # ahead of the threads
@@ -311,13 +313,13 @@ class Composer:
             is_disc = index >= first
             self._after["sh0"][members.rows[at[is_disc]]] += change.numpy()[index[is_disc] - first]
 
-    def _maps_others(self, stack: Sequence[tuple[int, Layer]]) -> bool:
+    def _maps_others(self, stack: Sequence[tuple[int, Layer]], blend: str) -> bool:
         """Return whether a grade lies over Gaussians of a lower layer and maps their colors."""
         return any(
             self._meet(edit, below)
             for index, (edit, layer) in enumerate(stack)
             for below, _ in stack[:index]
-            if layer.gdf.field.kind == "grade"
+            if layer.gdf.field.kind == "grade" and rule_of(layer, blend) == "adjust"
         )
 
     def _meet(self, edit: int, other: int) -> bool:
@@ -328,7 +330,7 @@ class Composer:
             self._meets[pair] = len(np.intersect1d(*members, assume_unique=True)) > 0
         return self._meets[pair]
 
-    def _write_adjusted(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
+    def _write_plainly(self, layers: Sequence[Layer], blend: str, rows: Rows, names: Sequence[str]) -> float:
         """Write rows with the reference implementation; return the largest movement of a center.
 
         Other rows are left as they are, because they may follow their anchors or lie in the order of paint.
@@ -337,7 +339,7 @@ class Composer:
         at, new = changed_rows(
             self._scene,
             layers,
-            "adjust",
+            blend,
             lambda _, gdf: covers[id(gdf)],
             lambda _, gdf: self._split_of(self._index[id(gdf)]),
         )
@@ -368,7 +370,8 @@ class Composer:
         """Write attributes of `rows[first:last]`; return the largest squared movement of a center."""
         rows = rows[first:last]
         parts = [_between(part, first, last) for part in parts]
-        kinds = {KINDS[name] for name in names} if blend == "normalized" else ()
+        averaged = any(rule_of(part.layer, blend) == "normalized" for part in parts)  # then all of them are
+        kinds = {KINDS[name] for name in names} if averaged else ()
         weight_sums = {kind: _weight_sum(parts, kind, len(rows)) for kind in kinds}
         largest = 0.0
         for name in names:
@@ -383,9 +386,9 @@ class Composer:
                 if KINDS[name] in part.layer.pushed_kinds:
                     pushing.append(part)
                     continue
-                covered = (
-                    self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NO_VALUES
-                )
+                covered = _NO_VALUES
+                if rule_of(part.layer, blend) in ORDERED:
+                    covered = self._coverage_of(part.edit)[KINDS[name]].numpy()
                 gain = min(abs(part.layer.gain(name)), 1.0)
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(gain)
                 self._add(total, part, name, factors, hidden, covered)

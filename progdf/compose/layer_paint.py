@@ -61,10 +61,11 @@ def decode(paint: str, members: int, from_others: int = 0) -> Tensor | None:
     )
 
 
-def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
-    """Build the composer's layer, with the painted weights.
+def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str, blend: str = "") -> Layer:
+    """Build the composer's layer, with the painted weights and its own blend rule, if any.
 
     Raises:
         ProgdfError: see `decode`.
     """
-    return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region), gdf.from_others))
+    weights = decode(paint, len(gdf.region), gdf.from_others)
+    return Layer(gdf, strength, True, gains, weights, blend)

@@ -63,6 +63,7 @@ class Layer:
     gains: Gains = Gains()  # factors per kind of change
     # soft membership times painted weight per member, 0 to 1; None is 1 everywhere. [M] float32
     weights: Tensor | None = None
+    blend: str = ""  # its own blend rule, one of `BLENDS`; "" for that of the stack
 
     @property
     def active(self) -> bool:
@@ -97,6 +98,17 @@ class Layer:
     def gain(self, attribute: str) -> float:
         """Return the gain of an attribute."""
         return float(getattr(self.gains, KINDS[attribute]))
+
+
+def rule_of(layer: Layer, blend: str) -> str:
+    """Return the blend rule of a layer in a stack with the rule `blend`."""
+    return layer.blend or blend
+
+
+def is_averaged_alone(layers: Sequence[Layer], blend: str) -> bool:
+    """Return whether "normalized" layers lie among layers with other rules, and are averaged alone."""
+    rules = {rule_of(layer, blend) for layer in layers}
+    return "normalized" in rules and len(rules) > 1
 
 
 def color_factors(layer: Layer, name: str, split: ColorSplit | None) -> tuple[float, float]:
@@ -159,8 +171,9 @@ def check_layers(layers: Sequence[Layer], blend: str) -> None:
 
 def check_numbers(layers: Sequence[Layer], blend: str) -> None:
     """Check strengths, gains and the blend rule, like `check_layers` without the slow check of weights."""
-    if blend not in BLENDS:
-        raise ProgdfError(f"unknown blend rule '{blend}'; use one of {', '.join(BLENDS)}")
+    for rule in (blend, *(layer.blend for layer in layers if layer.blend)):
+        if rule not in BLENDS:
+            raise ProgdfError(f"unknown blend rule '{rule}'; use one of {', '.join(BLENDS)}")
     for layer in layers:
         if not math.isfinite(layer.strength):
             raise ProgdfError(f"the strength of {layer.gdf.name} is {layer.strength}; use a number, 0 to 1")
@@ -195,8 +208,8 @@ class Change:
         return self.largest_move > 0
 
 
-Effect = tuple[tuple[float, Gains, Tensor | None, int, int], ...]
-"""Effect of an edit, per layer: strength, gains, weights, their version, and position in the stack.
+Effect = tuple[tuple[float, Gains, Tensor | None, int, int, str], ...]
+"""Effect of an edit, per layer: strength, gains, weights, their version, position in the stack, and its rule.
 
 The position is 0 for layers without an order: those that are not paint, under some blend rules.
 """
@@ -207,26 +220,30 @@ class Effects:
     """Effects of all edits under one blend rule. An edit without effect is absent."""
 
     blend: str = DEFAULT_BLEND
+    averaged_alone: bool = False  # see `is_averaged_alone`
     of: Mapping[int, Effect] = field(default_factory=dict)
 
 
 def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
     """Return the effects of active layers, which are given lowest first with the index of their edit."""
     effects: dict[int, Effect] = {}
+    layers = [layer for _, layer in stack]
+    ordered = any(rule_of(layer, blend) in ORDERED for layer in layers)
     for index, (edit, layer) in enumerate(stack):
         version = -1 if layer.weights is None else layer.weights._version
-        order = index if blend in ORDERED or layer.pushed_kinds else 0
-        entry = (layer.strength, layer.gains, layer.weights, version, order)
+        order = index if ordered or layer.pushed_kinds else 0
+        entry = (layer.strength, layer.gains, layer.weights, version, order, rule_of(layer, blend))
         effects[edit] = (*effects.get(edit, ()), entry)
-    return Effects(blend, effects)
+    return Effects(blend, is_averaged_alone(layers, blend), effects)
 
 
 def changed_edits(before: Effects, now: Effects) -> frozenset[int]:
     """Return the indices of edits whose members may differ. Weights are compared by identity and version."""
+    all_differ = (now.blend, now.averaged_alone) != (before.blend, before.averaged_alone)
     return frozenset(
         edit
         for edit in {*before.of, *now.of}
-        if now.blend != before.blend or not _same(before.of.get(edit, ()), now.of.get(edit, ()))
+        if all_differ or not _same(before.of.get(edit, ()), now.of.get(edit, ()))
     )
 
 

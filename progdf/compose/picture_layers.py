@@ -110,5 +110,5 @@ def compose_picture(
     for layer in stack:
         state = layer.state
         gains = Gains(state.geometry, state.opacity, state.color, state.texture)
-        composed.append(layer_of(edits[id(layer.gdf)], state.strength, gains, state.paint))
+        composed.append(layer_of(edits[id(layer.gdf)], state.strength, gains, state.paint, state.blend))
     return compose_layers(extended, composed, blend)

@@ -7,7 +7,7 @@ in preallocated buffers while a slider is dragged.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,9 @@ from .layers import (
     check_layers,
     color_factors,
     disc_changes,
+    is_averaged_alone,
     needs_split,
+    rule_of,
 )
 from .overlap import ARRANGED, arrange, find_paint, paint_layers, tints_rim
 from .parents.rows import carry, still
@@ -335,11 +337,15 @@ def changed_rows(
     rows, parts = _parts(scene, layers, blend, covers, split)
     weight_sums = {kind: torch.zeros(len(rows)) for kind in KINDS.values()}  # Σ m s
     for part in parts:
-        for kind in part.layer.blended_kinds:
+        for kind in part.layer.blended_kinds if part.rule == "normalized" else ():
             weight_sums[kind][part.rows] += part.weights * part.layer.clamped_strength
+    averaged = all(part.rule == "normalized" for part in parts)
+    if is_averaged_alone(layers, blend):
+        divisors = {kind: sums.clamp(min=1.0) for kind, sums in weight_sums.items()}
+        parts = [replace(part, divisors=divisors if part.rule == "normalized" else {}) for part in parts]
 
     blended = [part for part in parts if not part.pushes("sh0")]
-    adjusted = _adjusted_colors(scene, rows, blended) if blend == "adjust" else {}
+    adjusted = _adjusted_colors(scene, rows, blended) if any(p.rule == "adjust" for p in parts) else {}
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [part for part in parts if part.moves(name)]
@@ -350,8 +356,8 @@ def changed_rows(
         total = adjusted.get(name, torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO))
         for part in movers if name not in adjusted else ():
             if not part.pushes(name):
-                part.add(total, name, hides=blend in ORDERED)
-        if blend == "normalized":
+                part.add(total, name)
+        if averaged:
             total = total / weight_sums[KINDS[name]].clamp(min=1.0)[:, None]
         pushing = [part for part in movers if part.pushes(name)]
         if pushing:
@@ -376,12 +382,15 @@ class _LayerMembers:
     # share of lower layers that this layer hides, see `coverage`; empty for rules without an order. [M]
     # float32
     coverage: Mapping[str, Tensor]
+    rule: str  # blend rule of the layer
     split: ColorSplit | None = None  # color and texture of the edit, if the layer's gains divide them
+    # by kind, max(1, Σ m s) of a layer that is averaged among layers with other rules. [U]
+    divisors: Mapping[str, Tensor] = field(default_factory=dict)
 
-    def add(self, total: Tensor, name: str, hides: bool) -> None:
+    def add(self, total: Tensor, name: str) -> None:
         """Add the layer's offsets of one attribute to the sums. [U,c]"""
         below = total[self.rows]
-        if hides:
+        if self.rule in ORDERED:
             gain = min(abs(self.layer.gain(name)), 1.0)
             hidden = torch.tensor(self.layer.clamped_strength) * torch.tensor(gain)
             below = below * (
@@ -392,6 +401,8 @@ class _LayerMembers:
     def add_offsets(self, below: Tensor, name: str) -> Tensor:
         """Return sums of these members plus the layer's offsets of one attribute times its gains. [m,c]"""
         weight = self.weights[:, None]
+        if KINDS[name] in self.divisors:
+            weight = weight / self.divisors[KINDS[name]][self.rows, None]
         strength = self.layer.strength
         factor, color_factor = color_factors(self.layer, name, self.split)
         offsets = self.layer.gdf.field.attribute_offsets(name, strength)[self.members]
@@ -452,7 +463,7 @@ def _kept_pushes(parts: Sequence[_LayerMembers], count: int) -> Tensor:
 
 
 def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembers]) -> dict[str, Tensor]:
-    """Return the sums of the color attributes under "adjust". [U,c] each"""
+    """Return the sums of the color attributes with layers under "adjust". [U,c] each"""
     moved = {name for part in parts for name in _COLORS if part.moves(name)}
     old = {name: getattr(scene, name)[rows].float().flatten(1) for name in _COLORS if name in moved}
     total = {name: torch.full_like(values, NEGATIVE_ZERO) for name, values in old.items()}
@@ -462,9 +473,9 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
         names = [name for name in old if part.moves(name)]
         before = {name: total[name][part.rows].clone() for name in names}
         for name in names:
-            part.add(total[name], name, hides=True)
+            part.add(total[name], name)
         is_touched = touched[part.rows]
-        if isinstance(form, GradeForm) and names and bool(is_touched.any()):
+        if part.rule == "adjust" and isinstance(form, GradeForm) and names and bool(is_touched.any()):
             sh = [
                 (old[n][part.rows] + before[n])[is_touched].reshape(int(is_touched.sum()), -1, 3)
                 for n in names
@@ -506,7 +517,8 @@ def _parts(
             members,
             _ALL_ROWS if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
-            covers(scene, layer.gdf) if blend in ORDERED else {},
+            covers(scene, layer.gdf) if rule_of(layer, blend) in ORDERED else {},
+            rule_of(layer, blend),
             split(scene, layer.gdf) if needs_split(layer) else None,
         )
         for layer, layer_rows, (members, weights) in zip(layers, reached, chosen, strict=True)

@@ -59,6 +59,7 @@ class PictureLayer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     color: _Share = 1.0
     texture: Annotated[float, msgspec.Meta(ge=0.0, le=2.0)] = 1.0
     paint: str = ""  # painted weights, see `progdf.compose.layer_paint`
+    blend: str = ""  # its own blend rule; "" for that of the stack
 
 
 class PictureLayers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -36,6 +36,7 @@ def full_view() -> ViewState:
             solo=True,
             paint=painted,
             group="warm",
+            blend="sum",
         ),
         replace(view.layers[0], enabled=False),
     )

@@ -11,6 +11,7 @@ from imgui_bundle import imgui, imgui_ctx
 
 from progdf.errors import ProgdfError
 from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
+from viewer.panel.card import BLEND_TITLES
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
@@ -429,6 +430,8 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
         elif name == "reduced_motion":
             text = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
             work = workspace.with_message(work, text, pointer.now)
+        elif name == "blend":
+            work = workspace.with_message(work, _describe_blend(work), pointer.now, seconds=UNDO_S)
         elif name == "compare_snapshots" and not work.snapshots:
             text = f"There is no snapshot to compare; {shortcut('snapshot')} adds one"
             work = workspace.with_message(work, text, pointer.now)
@@ -441,6 +444,14 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
             entry = history.describe_entry(work.past, len(work.past.past))
             work = workspace.with_message(work, f"Back to: {entry}", pointer.now, seconds=UNDO_S)
     return work
+
+
+def _describe_blend(work: Workspace) -> str:
+    """Return the blend rule of the focused layer, or else of the stack, as a message."""
+    if work.focus is None:
+        return f"Blend of all layers: {BLEND_TITLES[work.view.blend]}"
+    layer = work.view.layers[work.focus]
+    return f"Blend: {BLEND_TITLES[layer.blend or work.view.blend]} ({layer.name})"
 
 
 MAX_REFINE_GROWTH = 2.0

@@ -104,7 +104,6 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
             again = "" if first == path else f", first as {first}"
             raise ProgdfError(f"{path} was given twice{again}; give each edit once")
     view = ViewState(overshoot=stack.overshoot)
-    view = view if stack.blend is None else replace(view, blend=stack.blend)
     if drawing is not None:
         view = replace(view, background=parse_background(drawing.background))
     opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
@@ -115,7 +114,8 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
         _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)
     up = drawing.up if drawing else "auto"
-    return OpenStack(opened, replace(view, layers=layers), up_option=up, warning="; ".join(notes))
+    view = with_blends(replace(view, layers=layers), stack.blend)
+    return OpenStack(opened, view, up_option=up, warning="; ".join(notes))
 
 
 def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.WindowSession, Path | None]:
@@ -167,7 +167,11 @@ def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenSt
     ]
     strengths = parse_strengths(saved.view.layers, settings, stacks.largest_strength(saved.view))
     layers = tuple(replace(l, strength=strengths.get(l.name, l.strength)) for l in saved.view.layers)
-    view = replace(saved.view, layers=layers, blend=stack.blend or saved.view.blend)
+    rules = [
+        f"{opened.layer(name)}{equals}{rule}"
+        for name, equals, rule in (t.rpartition("=") for t in stack.blend)
+    ]
+    view = with_blends(replace(saved.view, layers=layers), rules)
     if up != "auto":  # otherwise the session's own
         view = replace(view, camera=with_up(view.camera, opened.up))
     return replace(opened, view=view)
@@ -188,6 +192,23 @@ def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -
         check_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)
     return tuple(layers.values())
+
+
+def with_blends(view: ViewState, texts: Sequence[str]) -> ViewState:
+    """Return the view with the blend rules of options `RULE`, for all layers, and `NAME=RULE`, for one.
+
+    Raises:
+        ProgdfError: there is no such layer.
+    """
+    for text in texts:
+        name, equals, rule = text.rpartition("=")
+        if not equals:
+            view = replace(view, blend=rule)
+            continue
+        check_edit(name, view.layers, "--blend")
+        layers = (replace(layer, blend=rule) if layer.name == name else layer for layer in view.layers)
+        view = replace(view, layers=tuple(layers))
+    return view
 
 
 def parse_strengths(edits: Sequence[Named], settings: Sequence[str], most: float) -> dict[str, float]:

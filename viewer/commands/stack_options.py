@@ -15,10 +15,11 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.scene import UpChoice
 
-Blend = Literal["normalized", "sum", "over", "adjust"]
 NO_SCENE = Path()
 """Placeholder for a missing scene."""
 SESSION = "--session"
+RULES = ("normalized", "sum", "over", "adjust")
+"""Blend rules, as `progdf.compose.layers.BLENDS`, whose import takes seconds."""
 _BARE_VALUES = {"--split": "0.5", "--difference": "4"}  # value of an option given without one
 
 
@@ -57,8 +58,14 @@ class StackOptions:
     """Show this edit alone; repeatable."""
     overshoot: Switch = False
     """Allow strengths up to 1.2 and gains of texture up to 2, which extrapolate."""
-    blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None
-    """Blend rule for edits that share Gaussians."""
+    blend: Annotated[tuple[str, ...], UseAppendAction, word("[NAME=]RULE", "the session's, else adjust")] = ()
+    """Blend rule for edits that share Gaussians, of all or of one: normalized, sum, over or adjust."""
+
+    def __post_init__(self) -> None:
+        for text in self.blend:
+            rule = text.rpartition("=")[2]
+            if rule not in RULES:
+                raise ProgdfError(f"--blend {text}: unknown rule '{rule}'; use one of {', '.join(RULES)}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -95,6 +95,7 @@ def picture_layers(opened: Document, view: ViewState) -> PictureLayers | None:
                 color=gains.color,
                 texture=gains.texture,
                 paint=layer.paint,
+                blend=layer.blend,
             )
         )
     return PictureLayers(view.blend, tuple(found)) if found else None

@@ -121,7 +121,7 @@ def picture(
 def compose_view(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, share: float = 1.0) -> Gaussians:
     """Compose the scene with the layers of a view, at a share of their strengths."""
     states = visible_layers(view)
-    layers = [layer_of(gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
+    layers = [layer_of(gdfs[s.gdf], share * s.strength, s.gains, s.paint, s.blend) for s in states]
     return compose_layers(scene, layers, view.blend)
 
 
@@ -163,6 +163,7 @@ def first_state(
             "gains": asdict(state.gains),
             "paint": known.get((state.gdf, state.paint), -1),
             "group": state.group,
+            "blend": state.blend,
         }
 
     def stack(camera: ViewCamera, of: ViewState | history.Edit) -> dict[str, Any]:

@@ -27,7 +27,9 @@ from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     card,
+    checkbox,
     elide,
+    entry,
     grip,
     group_digits,
     hint,
@@ -114,12 +116,19 @@ CARD_PX = 66.0  # height of a card with the gap to the next one, at 1×
 COMPACT_PX = 7.0  # padding of a compact row, at 1×
 SLIDER_PX = 92.0  # width of the slider in a compact row or a group row, at 1×
 SLIM_PX = 16.0  # height of this slider, at 1×
+BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
+BLEND_HELP = {
+    "normalized": "Overlapping edits are averaged by weight, never more than one full edit.",
+    "sum": "Overlapping edits add up.",
+    "over": "An edit covers those below it, in proportion to its change.",
+    "adjust": "Like Over, but color edits change the colors below: darkened stripes stay stripes.",
+}
 _BUSY = ("queued", "running", "stopping")  # states of a job that will fill a hole
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
     *("limit_to_selection", "select_painted", "", "reset", ""),
-    *("group", "select_layers", "reset_all"),
+    *("group", "set_blend", "select_layers", "reset_all"),
 )
 _LAYER_ACTIONS = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
 """Actions that receive the layer's index. All other actions of the menu apply to the selected layers."""
@@ -196,7 +205,7 @@ def draw_card(
         if strength != layer.strength:  # building a new state is slow, and most cards do not change
             work = _change_layer(work, index, lambda old: replace(old, strength=strength))
         if focused and row.hole:
-            actions += _fill_box(work, index, row)
+            actions += _fill_box(work, index, row, ui)
         if layer.gdf in work.view.unfolded:
             work = _about(work, index, row, ui)
             active_slider = work.active_slider if focused else None
@@ -211,8 +220,12 @@ def draw_card(
         if press:  # a press starts a drag of all selected layers; a click selects this one on release
             imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
             press = "keep" if press == "one" and several > 1 else press
-        if touch.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
+        left = imgui.MouseButton_.left.value
+        moved = imgui.get_mouse_drag_delta(left)
+        is_click = imgui.is_mouse_released(left) and not (moved.x or moved.y)
+        if over and is_click and imgui.get_state_storage().get_bool(alone):
             press = "one"
+            imgui.get_state_storage().set_bool(alone, False)
         down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels the drag
         if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
             press = "keep"
@@ -224,7 +237,7 @@ def draw_card(
     return work, replace(touch, touched=touched or bool(press), press=press)
 
 
-def _fill_box(work: Workspace, index: int, row: LayerRow) -> list[Action]:
+def _fill_box(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> list[Action]:
     """Draw the check box that fills the hole of a removal; return its action if it was pressed."""
     gdf = work.view.layers[index].gdf
     job = next((job for job in work.jobs if job.fills == gdf and job.status in _BUSY), None)
@@ -236,7 +249,8 @@ def _fill_box(work: Workspace, index: int, row: LayerRow) -> list[Action]:
         left = "" if job.seconds_left is None else f", {format_duration(job.seconds_left)} left"
         text = f"Filling the hole: {100 * job.share:.0f} %{left}"
     with inert(work.view.layers[index].locked or is_stopping):
-        pressed, _ = imgui.checkbox(f"{text}##hole", row.hole == "filled" or job is not None)
+        fills = row.hole == "filled" or job is not None
+        pressed = checkbox(f"{text}##hole", fills, ui) != fills
     tip(
         "Continue the surface around the hole, with its texture if the extra fill is installed. The fill has "
         "the scene's own colors: recolored surroundings do not recolor it"
@@ -279,6 +293,8 @@ def _menu(
         for action in _MENU_ITEMS if is_open else ():
             if action == "group":
                 _group_menu(state, state.layers[index], ui, actions)
+            elif action == "set_blend":
+                _blend_menu(state, state.layers[index], ui, actions)
             elif not action:
                 imgui.separator()
             else:
@@ -298,6 +314,16 @@ def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: lis
                 actions.append(WithText("group", group.name))
         if layer.group and menu_item("ungroup"):
             actions.append(Plain("ungroup"))
+        imgui.end_menu()
+
+
+def _blend_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[Action]) -> None:
+    """Draw the choice of the layer's blend rule."""
+    if imgui.begin_menu("Blend"):
+        titles = {"": f"As all layers ({BLEND_TITLES[state.blend]})", **BLEND_TITLES}
+        for rule, title in titles.items():
+            if entry(title, BLEND_HELP.get(rule, ""), layer.blend == rule, PALETTE.text, ui):
+                actions.append(WithText("set_blend", rule))
         imgui.end_menu()
 
 

@@ -29,6 +29,7 @@ from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     accent_button,
     elide,
+    entry,
     grip,
     hint,
     icon_button,
@@ -46,7 +47,7 @@ from viewer.ui.widgets import (
 )
 
 from . import slider
-from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
+from .card import BLEND_HELP, BLEND_TITLES, COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 
 MASTER_PX = 20.0  # height of the slider for several layers, at 1×
 SEARCH_THRESHOLD = 6
@@ -212,13 +213,6 @@ def _group_name(
 HEADING_PX = 34.0  # height of the heading above the cards, at 1×
 _DRAGS = ("dragged", "dropped")
 INSET_PX = 10.0  # indentation of a group's layers, at 1×
-BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
-BLEND_HELP = {
-    "normalized": "Overlapping edits are averaged by weight, never more than one full edit.",
-    "sum": "Overlapping edits add up.",
-    "over": "An edit covers those below it, in proportion to its change.",
-    "adjust": "Like Over, but color edits change the colors below: darkened stripes stay stripes.",
-}
 
 
 @dataclass(frozen=True)
@@ -257,11 +251,10 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Works
 def _choose_rules(work: Workspace, ui: UiContext, actions: list[Action]) -> ViewState:
     """Draw the menu for all layers: blend rule, overshoot, compact rows. Return the changed state."""
     state = work.view
-    imgui.text_disabled(f"Where edits overlap ({shortcut('blend')})")
+    imgui.text_disabled("Blend rule of layers without their own")
     for blend in BLENDS:
-        if imgui.menu_item(BLEND_TITLES[blend], "", state.blend == blend)[0]:
+        if entry(BLEND_TITLES[blend], BLEND_HELP[blend], state.blend == blend, PALETTE.text, ui):
             state = replace(state, blend=blend)
-        tip(BLEND_HELP[blend])
     imgui.separator()
     if menu_item("overshoot", state.overshoot):
         state = with_overshoot(state, not state.overshoot)

@@ -44,7 +44,7 @@ DRAWS = ("auto", "gl", "cpu")
 class _Edits:
     """Inputs of the composed attributes: the effective layers and the blend rule."""
 
-    layers: tuple[tuple[int, float, Gains, str], ...] = ()
+    layers: tuple[tuple[int, float, Gains, str, str], ...] = ()
     blend: str = ""
     version: int = -1  # see `ViewEngine.touch`; −1 for the current state
 
@@ -368,7 +368,8 @@ def _with_hidden(highlight: Highlight | None, view: ViewState) -> Highlight | No
 
 def _edits(view: ViewState) -> _Edits:
     """Return the effective layers. Changes of invisible layers and layers at strength 0 cause no work."""
-    layers = tuple((l.gdf, l.strength, l.gains, l.paint) for l in visible_layers(view) if l.strength != 0.0)
+    active = [layer for layer in visible_layers(view) if layer.strength != 0.0]
+    layers = tuple((l.gdf, l.strength, l.gains, l.paint, l.blend) for l in active)
     return _Edits(layers, view.blend) if layers else _Edits()
 
 

@@ -416,6 +416,15 @@ def _set_mode(workspace: Workspace, mode: str) -> Workspace:
     return replace(workspace, view=replace(workspace.view, mode=mode))
 
 
+def _next_blend(workspace: Workspace, _: None) -> Workspace:
+    """Set the selected layers to the rule after that of the focused one, or else the rule of the stack."""
+    if workspace.focus is None:
+        return _next_value(workspace, "blend", BLENDS)
+    view = workspace.view
+    rule = following(BLENDS, view.layers[workspace.focus].blend or view.blend)
+    return layer_selection.change_selected(workspace, lambda _, layer: replace(layer, blend=rule))
+
+
 def _go_to_entry(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
@@ -515,7 +524,8 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "rename_group": _rename_group,
     "search": lambda workspace, _: replace(workspace, searching=bool(workspace.view.layers)),
     "cards": _toggle_cards,
-    "blend": lambda w, _: _next_value(w, "blend", BLENDS),
+    "blend": _next_blend,
+    "set_blend": lambda w, rule: layer_selection.change_selected(w, lambda _, l: replace(l, blend=rule)),
     "select_tool": _toggle_tool,
     "select_through": lambda w, _: replace(
         w, view=replace(w.view, select=replace(w.view.select, through=not w.view.select.through))

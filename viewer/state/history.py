@@ -218,6 +218,7 @@ _LAYER_LABELS = {
     "solo": "solo",
     "locked": "lock",
     "group": "group",
+    "blend": "blend rule",
 }
 _SELECTION_LABELS = {"regions": "regions", "hidden": "hidden splats", "members": "selection"}
 _EDIT_LABELS = {

@@ -46,6 +46,7 @@ Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Unit = Annotated[float, Meta(gt=0.0, le=1e12)]
 Strength = Annotated[float, Meta(ge=0.0, le=OVERSHOOT)]
 Blend = Annotated[str, one_of(BLENDS)]
+LayerBlend = Annotated[str, one_of(("", *BLENDS))]
 Frame = Annotated[int, Meta(ge=0)]
 Length = Annotated[int, Meta(ge=1, le=MAX_FRAME)]
 Fps = Annotated[int, Meta(ge=1, le=MAX_FPS)]
@@ -67,6 +68,7 @@ class LayerState:
     locked: bool = False  # protects strength, gains and paint
     paint: str = ""  # weight per member, from `layer_paint.encode`; empty is 1 everywhere
     group: str = ""  # name of its group, "" for none; the layers of a group are adjacent
+    blend: LayerBlend = ""  # its own blend rule, "" for that of the stack
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ class ViewState:
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
-    blend: Blend = DEFAULT_BLEND
+    blend: Blend = DEFAULT_BLEND  # rule of all layers without their own
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     panel: bool = True  # show the panel and all overlays
     compare: Comparison = Comparison()

@@ -176,7 +176,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("search", "Search layers…", "Ctrl+F", types=True),
     ),
     "Edits": (
-        Command("blend", "Next blend rule", "M"),
+        Command("blend", "Next blend rule", "M", "Of the selected layer, or else of all layers"),
         Command("overshoot", "Overshoot to 1.2", "O", "Sliders extrapolate past the trained range"),
         Command("unfocus", "Leave tool, deselect", "Escape"),
         Command("undo", "Undo", "Ctrl+Z", repeats=True),

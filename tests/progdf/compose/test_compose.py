@@ -287,9 +287,10 @@ def random_stack(rng: np.random.Generator, wardrobe: list[Gdf], order: np.ndarra
     return layers
 
 
+@pytest.mark.parametrize("mixed", [False, True])
 @pytest.mark.parametrize("blend", BLENDS)
 def test_composer_matches_compose_through_a_random_session(
-    scene: Gaussians, wardrobe: list[Gdf], blend: str
+    scene: Gaussians, wardrobe: list[Gdf], blend: str, mixed: bool
 ) -> None:
     rng = np.random.default_rng(BLENDS.index(blend))
     composer = Composer(scene, wardrobe)
@@ -298,6 +299,8 @@ def test_composer_matches_compose_through_a_random_session(
         if step % 5 == 0:
             order = rng.permutation(4)[: rng.integers(0, 5)]
         layers = random_stack(rng, wardrobe, order)
+        if mixed:
+            layers = [replace(layer, blend=str(rng.choice(["", *BLENDS]))) for layer in layers]
         changes = composer.update(layers, blend)
         assert bits(composer.gaussians) == bits(compose_layers(scene, layers, blend))
         now = pack(composer.gaussians, True).clone()
@@ -308,6 +311,40 @@ def test_composer_matches_compose_through_a_random_session(
         farthest = float((now[:, :3].double() - before[:, :3].double()).norm(dim=1).max())
         assert changes.largest_move == pytest.approx(farthest, rel=1e-5, abs=1e-7)
         before = now
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_layers_with_one_rule_are_a_stack_with_that_rule(
+    scene: Gaussians, wardrobe: list[Gdf], blend: str
+) -> None:
+    layers = random_stack(np.random.default_rng(7), wardrobe, np.arange(4))
+    own = [replace(layer, blend=blend) for layer in layers]
+    expected = compose_layers(scene, layers, blend)
+    for other in BLENDS:
+        assert bits(compose_layers(scene, own, other)) == bits(expected)
+
+
+def test_layer_over_others_hides_only_those_below(scene: Gaussians, shirt: Gdf) -> None:
+    members = shirt.region.members
+    flat = [
+        edit_of(scene, members, curved_field(150, seed, moving=("sh0",)), str(seed)) for seed in (3, 4, 5)
+    ]
+    low, middle, top = (change(scene, compose_layers(scene, [Layer(gdf)], "sum"))[members] for gdf in flat)
+    layers = [Layer(flat[0]), Layer(flat[1], blend="over"), Layer(flat[2])]
+    found = change(scene, compose_layers(scene, layers, "sum"))[members]
+    covered = coverage(scene, flat[1])["color"][:, None]
+    assert torch.allclose(found, low * (1 - covered) + middle + top, atol=1e-5)
+
+
+def test_averaged_layers_are_averaged_without_the_added_one(scene: Gaussians, shirt: Gdf) -> None:
+    members = shirt.region.members
+    flat = [
+        edit_of(scene, members, curved_field(150, seed, moving=("sh0",)), str(seed)) for seed in (3, 4, 5)
+    ]
+    low, middle, top = (change(scene, compose_layers(scene, [Layer(gdf)], "sum"))[members] for gdf in flat)
+    layers = [Layer(flat[0]), Layer(flat[1]), Layer(flat[2], blend="sum")]
+    found = change(scene, compose_layers(scene, layers, "normalized"))[members]
+    assert torch.allclose(found, (low + middle) / 2 + top, atol=1e-5)
 
 
 @pytest.mark.parametrize("blend", BLENDS)
@@ -545,7 +582,7 @@ def test_grades_without_common_rows_use_the_fast_path_of_adjust(
 ) -> None:
     halves = [graded(scene, half, 0.6) for half in torch.arange(len(scene)).split(len(scene) // 2)]
     composer = Composer(scene, [*halves, hat])
-    monkeypatch.setattr(composer, "_write_adjusted", None)
+    monkeypatch.setattr(composer, "_write_plainly", None)
     for stack in ([Layer(halves[1], 0.3), Layer(halves[0], 0.8)], [Layer(halves[1], 0.3), Layer(hat, 0.5)]):
         composer.update(stack, "adjust")
         assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))

@@ -112,12 +112,15 @@ def test_blend_option_overrides_the_session(here: Path) -> None:
     scene, _, ears = bear().save(here)
     opened = document.load(scene, [ears, ears])
     session.save(here / "work.session.json", WindowSession(opened, view))
-    for name, given in (("own", ()), ("sum", ("--blend", "sum"))):
+    one = ("--blend", "ears=sum")
+    for name, given in (("own", ()), ("sum", ("--blend", "sum")), ("one", one)):
         assert run("export", "work.session.json", "--set", "ears=1", *given, "-o", f"{name}.ply") == 0
-        shown = replace(view, blend=given[1] if given else view.blend)
+        shown = replace(view, blend=given[1] if name == "sum" else view.blend)
         layers = tuple(
             replace(layer, strength=1.0 if layer.gdf == 0 else layer.strength) for layer in view.layers
         )
+        if name == "one":
+            layers = tuple(replace(l, blend="sum" if l.gdf == 0 else l.blend) for l in layers)
         expected = ViewEngine(None, opened.scene, opened.gdfs).gaussians(replace(shown, layers=layers))
         assert torch.allclose(load_ply(f"{name}.ply").means, expected.means, atol=1e-6)
     assert not torch.equal(load_ply("own.ply").sh0, load_ply("sum.ply").sh0)

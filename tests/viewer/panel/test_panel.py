@@ -248,7 +248,7 @@ def test_click_on_a_card_focuses_it(hand: Hand) -> None:
 def test_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> None:
     hand.click(SIZE[0] - 25, 70)
     place = imgui.get_current_context().open_popup_stack[0].window.pos / hand.ui.scale
-    hand.click(place.x + 40, place.y + 8 + 21 * 2 + 7)
+    hand.click(place.x + 40, place.y + 8 + 21 + 1.5 * 40)
     assert hand.work.view.blend == "sum"
     assert perform(hand.work, Plain("undo"), FACTS).view == STACK
 

@@ -66,12 +66,16 @@ def test_strengths_of_twenty_compact_rows_move_together(
         assert hand.strengths[0] == pytest.approx(0.25, abs=0.01), "the last row is in reach"
         hand.click(SIZE[0] - 25.0, 70.0)
         place = imgui.get_current_context().open_popup_stack[0].window.pos
-        hand.click(place.x + 40.0, place.y + 8.0 + 21.0 * 2 + 7.0)
+        hand.click(place.x + 40.0, place.y + 8.0 + 21.0 + 1.5 * 40.0)
         assert hand.main_view.work.view.blend == "sum", "and so is the blend rule"
         hand.click(NAME, row(0))
         click_with(hand, imgui.Key.mod_shift, NAME, row(19))
         assert len(selected(hand)) == 20
         entries = len(hand.main_view.work.past.past)
+        hand.click(NAME - 25.0, row(2))
+        assert selected(hand) == [order(hand)[2]], "a click on one of them selects it alone"
+        hand.click(NAME, row(0))
+        click_with(hand, imgui.Key.mod_shift, NAME, row(19))
         start = (MASTER[0] + 0.5 * MASTER[2], MASTER[1])
         composed = Count(monkeypatch, Composer, "update")
         drawn = hand.main_view.canvas.pictures_drawn

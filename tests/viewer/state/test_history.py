@@ -95,6 +95,7 @@ CHANGES: dict[str, Callable[[ViewState], ViewState]] = {
         v, layers=tuple(replace(one, strength=0.1) for one in v.layers)
     ),
     "gains of ears": layer(gains=Gains(0.5, 1.0, 1.0)),
+    "blend rule of ears": layer(blend="over"),
     "visibility of ears": layer(enabled=False),
     "lock of ears": layer(locked=True),
     "name of gold": layer(name="gold"),

@@ -17,6 +17,7 @@ from progdf.compose.reference import Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES
+from progdf.tidy import Step, tidy
 from tests.helpers.stacks import Stack, bear_stack
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.camera.view_camera import ViewCamera, eye, to_camera
@@ -167,7 +168,11 @@ def test_keys_do_everything_that_the_cards_do(hand: Rig) -> None:
     assert names(hand) == ["ears", "scarf"]
     assert hand.main_view.work.focus == 0, "the focus goes with its layer"
     hand.key("M")
-    assert hand.main_view.work.view.blend == BLENDS[0], "on from adjust, the last"
+    assert [layer.blend for layer in layers(hand)] == [BLENDS[0], ""], "on from adjust, the last"
+    assert hand.main_view.work.view.blend == BLENDS[-1], "the rule of the stack stays"
+    message = hand.main_view.work.message
+    assert message is not None
+    assert message.text == "Blend: Average (ears)"
     hand.key("O")
     for _ in range(9):
         hand.key("Shift+Right")
@@ -345,6 +350,12 @@ def test_layer_rows_count_shared_members_and_list_gain_kinds() -> None:
     scarf, ears = (len(gdf.region) for gdf in stack.gdfs)
     assert [row.shared for row in rows] == [(scarf, 0, scarf), (0, ears, 0), (scarf, 0, scarf)]
     assert [row.kinds for row in rows[:2]] == [{"color", "texture"}, {"color", "geometry", "texture"}]
+
+
+def test_thumbnail_of_a_removal_shows_the_removed_part() -> None:
+    stack = bear()
+    removed = tidy(stack.scene, [Step("remove", stack.gdfs[0].region)], "removed")
+    assert np.ptp(facts.draw_thumbnail(stack.scene, removed, ViewCamera()).astype(int)) > 100
 
 
 def test_thumbnail_of_a_large_region_uses_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:

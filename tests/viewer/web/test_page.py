@@ -41,7 +41,7 @@ from viewer.files.web_page import PageOptions, write_page
 from viewer.state import snapshots, timeline
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import Keyframe, LayerGroup, LayerState, Timeline, ViewState
-from viewer.web.page import join
+from viewer.web.page import PageTexts, join
 
 SIZE = 660, 400
 PIXELS = 330, 200  # half the resolution renders four times as fast in the software renderer
@@ -224,6 +224,10 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
         ([random_layer(document.gdfs[i], draws) for i in draws.order(len(gdfs)).tolist()], blend)
         for blend in BLENDS * 6
     ]
+    for layers, blend in stacks[-len(BLENDS) * 2 :]:
+        rules = ["", *BLENDS]
+        own = [rules[int(5 * float(draws.uniform(1)))] for _ in layers]
+        stacks.append(([replace(layer, blend=rule) for layer, rule in zip(layers, own, strict=True)], blend))
     stacks.append(([Layer(document.gdfs[1], 0.1), Layer(document.gdfs[2], 0.8)], "adjust"))  # few are black
     for number, (layers, blend) in enumerate(stacks):
         sent = []
@@ -236,6 +240,7 @@ def test_page_computes_every_attribute_like_compose_for_every_rule(
                     "edit": edit,
                     "strength": layer.strength,
                     "gains": asdict(layer.gains),
+                    "blend": layer.blend,
                     "weights": weights,
                     "paint": number,
                 }
@@ -378,6 +383,12 @@ def test_page_starts_with_the_session_blend_rule_and_can_change_it(open_page: An
         plain = compose_layers(scene, [Layer(gdf, 0.8) for gdf in gdfs], rule).sh0[order[: len(colors)]]
         assert np.abs(colors - plain.numpy()).max() < 1e-5, text
     assert opened.complaints == []
+
+
+def test_panel_follows_the_background() -> None:
+    still = torch.zeros(2, 2, 3)
+    shades = [PageTexts("bear", "", (gray,) * 3, still).shade for gray in (0.0, 0.4, 0.6, 1.0)]
+    assert shades == ["dark", "dark", "light", "light"]
 
 
 def test_space_shows_the_original_while_held(open_page: Any, bear_page: tuple[Path, Stack]) -> None:

@@ -481,7 +481,7 @@ def _point_pose(pose: HandlePose, owners: NDArray[np.int64]) -> HandlePose:
 
 def _stack(problem: _Problem) -> list[Layer]:
     return [
-        layer_of(problem.gdfs[layer.gdf], layer.strength, layer.gains, layer.paint)
+        layer_of(problem.gdfs[layer.gdf], layer.strength, layer.gains, layer.paint, layer.blend)
         for layer in problem.layers
     ]
 

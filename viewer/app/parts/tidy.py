@@ -94,7 +94,7 @@ def _copy_source(
         paint_on_object = rows_on(gdf, torch.from_numpy(own)).numpy()
         is_left_behind = len(paint_on_object) > 0 and not paint_rows[paint_on_object].any()
         if not is_left_behind:
-            layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint))
+            layers.append(layer_of(gdf, layer.strength, layer.gains, layer.paint, layer.blend))
     composed = compose_layers(document.scene, layers, view.blend)
     is_drawn = (composed.logit_opacities >= UNSEEN_LOGIT).numpy()
     keeps_opacity = (composed.logit_opacities == document.scene.logit_opacities).numpy()

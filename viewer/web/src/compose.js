@@ -141,7 +141,7 @@ export class Composer {
   // Returns the change { ranges [first, last], names }, or null.
   update(layers, blend) {
     const active = layers.filter((layer) => layer.strength !== 0).map((layer) =>
-      ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint]) }));
+      ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint, layer.blend]) }));
     const ranges = [], names = new Set(), again = blend !== this.blend;
     this.blend = blend;
     const surfaceMoved = this.surface?.update(active, blend), paintMoved = this.paint?.update(active, blend);
@@ -149,7 +149,8 @@ export class Composer {
     for (const segment of this.segments) {
       const stack = active.filter((layer) => layer.edit in segment.members), { effects, first, rows } = segment;
       let same = 0;
-      if (!again) while (same < stack.length && stack[same].effect === effects[same]) same++;
+      const mixed = this.#averagedAlone(stack);  // then each average depends on all layers
+      if (!again && !mixed) while (same < stack.length && stack[same].effect === effects[same]) same++;
       const depends = (surfaceMoved && segment.followers.length) || (paintMoved && segment.paints) ||
         (movesChanged && this.carrier.touches(segment));
       if (same === stack.length && same === effects.length && !depends) continue;
@@ -183,7 +184,7 @@ export class Composer {
       }
       this.#add(segment, stack, at, totals);
     }
-    const shares = this.blend === "normalized", sums = {};
+    const shares = !this.#averagedAlone(stack) && stack.some((layer) => this.#rule(layer) === "normalized"), sums = {};
     for (const name of names) {
       const kind = KINDS[name];
       if (shares && !(kind in sums)) sums[kind] = this.#divisors(segment, stack, kind);
@@ -194,6 +195,16 @@ export class Composer {
       for (let j = 0; j < total.length; j++) total[j] += before[j];
     }
     if (totals.sh0) this.#colorDiscs(segment, stack, totals.sh0);
+  }
+
+  #rule(layer) {
+    return layer.blend || this.blend;
+  }
+
+  // Returns whether averaged layers lie among layers with another rule, and are averaged by themselves.
+  #averagedAlone(stack) {
+    const rules = new Set(stack.map((layer) => this.#rule(layer)));
+    return rules.has("normalized") && rules.size > 1;
   }
 
   // Changes the colors of painted discs by the gains of their layers; of two layers of one edit, the stronger one shows.
@@ -245,8 +256,9 @@ export class Composer {
     const moved = segment.names.filter((name) =>
       edit.attributes[name] && edit.moves(KINDS[name], layer.gains) && !edit.pushes.has(KINDS[name]));
     const colors = moved.filter((name) => KINDS[name] === "color");
-    const hides = at > 0 && (this.blend === "over" || this.blend === "adjust");
-    const map = hides && this.blend === "adjust" && edit.grade && colors.length
+    const rule = this.#rule(layer), hides = at > 0 && (rule === "over" || rule === "adjust");
+    const averaged = rule === "normalized" && this.#averagedAlone(stack);
+    const map = hides && rule === "adjust" && edit.grade && colors.length
       ? this.#graded(segment, stack, at, colors, totals) : null;
     for (const name of moved) {
       const kind = KINDS[name], width = this.widths[name], total = totals[name];
@@ -254,10 +266,12 @@ export class Composer {
       const gain = edit.weighted(name, layer, member * width, offsets, scratch);
       const covered = hides ? edit.coverage[kind].subarray(member, member + rows) : null;
       const hidden = held * fround(Math.min(Math.abs(layer.gains[kind]), 1));
-      if (!weights && !covered) for (let j = 0; j < total.length; j++) total[j] += gain * offsets[j];
+      const divisors = averaged ? this.#divisors(segment, stack, kind) : null;
+      if (!weights && !covered && !divisors) for (let j = 0; j < total.length; j++) total[j] += gain * offsets[j];
       else {
         for (let i = 0, j = 0; i < rows; i++) {
-          const weight = weights ? weights[member + i] : 1, factor = weight * gain, end = j + width;
+          const weight = weights ? weights[member + i] : 1, end = j + width;
+          const factor = weight * gain / (divisors ? divisors[i] : 1);
           const through = covered ? 1 - weight * hidden * covered[i] : 1;
           if (weight === 0) j = end;
           for (; j < end; j++) total[j] = through * total[j] + factor * offsets[j];
@@ -313,7 +327,8 @@ export class Composer {
 
   // Returns max(1, Σ m s) over the layers with this kind of change; null if it is 1 everywhere.
   #divisors({ rows, members }, all, kind) {
-    const stack = all.filter(({ edit }) => this.edits[edit].kinds.has(kind) && !this.edits[edit].pushes.has(kind));
+    const stack = all.filter((layer) => this.#rule(layer) === "normalized" &&
+      this.edits[layer.edit].kinds.has(kind) && !this.edits[layer.edit].pushes.has(kind));
     if (stack.reduce((sum, layer) => sum + clampedStrength(layer), 0) <= 1 - 1e-6) return null;
     const sums = new Float32Array(rows);
     for (const layer of stack) {
