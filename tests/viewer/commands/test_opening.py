@@ -108,7 +108,8 @@ def test_set_overrides_the_session_by_layer_or_edit_name(here: Path) -> None:
 
 def test_blend_option_overrides_the_session(here: Path) -> None:
     view = replace(full_view(), blend="normalized")
-    view = replace(view, layers=tuple(replace(layer, solo=False, enabled=True) for layer in view.layers))
+    shown_layers = tuple(replace(layer, solo=False, enabled=True, blend="") for layer in view.layers)
+    view = replace(view, layers=shown_layers)
     scene, _, ears = bear().save(here)
     opened = document.load(scene, [ears, ears])
     session.save(here / "work.session.json", WindowSession(opened, view))
