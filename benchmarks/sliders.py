@@ -35,7 +35,7 @@ from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, Train
 from trainer.report.measures import ErrorCurve, error_curves
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
-from trainer.resolve import resolve, use_threads
+from trainer.resolve import prepare_process, resolve
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
 from trainer.store.run_folder import write_json
@@ -80,7 +80,7 @@ def run_sliders(options: SliderOptions) -> list[CaseResult]:
     Raises:
         ProgdfError: the folder cannot be written to, or holds other runs.
     """
-    use_threads(options.threads)
+    prepare_process(options.threads)
     make_folder(options.folder)
     perceptual, warning = perceptual_loss()
     if warning:

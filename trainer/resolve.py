@@ -24,6 +24,7 @@ from trainer.editors import EDITORS, editor_row
 from trainer.editors.instruct import parse_guidance
 from trainer.editors.pictures import strengths_of
 from trainer.options import EditKind
+from trainer.store.memory import reuse_memory
 
 from .options import (
     LARGEST_SEED,
@@ -275,8 +276,9 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
             raise ProgdfError(f"{option} does not apply to --field {options.field}; add --field neural")
 
 
-def use_threads(threads: int) -> None:
-    """Set the number of threads of torch and the rasterizer; 0 is all cores."""
+def prepare_process(threads: int) -> None:
+    """Set the number of threads of torch and the rasterizer, 0 for all cores; and see `reuse_memory`."""
+    reuse_memory()
     count = count_threads(threads)
     torch.set_num_threads(count)
     set_threads(count)

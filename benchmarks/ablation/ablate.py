@@ -30,7 +30,7 @@ from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import smooth_course
 from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
-from trainer.resolve import resolve_kind, use_threads
+from trainer.resolve import prepare_process, resolve_kind
 from trainer.run.record import reopen_run
 from trainer.run.training import optimize_members, retime_trajectory
 from trainer.store.progress import RunLog
@@ -62,7 +62,7 @@ def ablate(options: AblateOptions, quiet: bool = False) -> list[Ablation]:
         KeyboardInterrupt: interrupted; the message names the folder of the finished variants.
     """
     check_options(options)
-    use_threads(options.threads)
+    prepare_process(options.threads)
     done = [_ablate_run(run, options, quiet) for run in options.runs]
     if options.markdown is not None:
         table = table_of(done, "The method part by part")

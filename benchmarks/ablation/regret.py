@@ -43,7 +43,7 @@ from trainer.optimize.color_views import add_bands, color_views
 from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, TrainingViewOptions
-from trainer.resolve import use_threads
+from trainer.resolve import prepare_process
 from trainer.run.training import StrengthSource, plan_colors
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import quantize_image
@@ -329,7 +329,7 @@ def run_regret(options: RegretOptions) -> Table:
     Raises:
         ProgdfError: the scene, region or editor cannot be used.
     """
-    use_threads(1)
+    prepare_process(1)
     scene = load_scene(options.scene)
     region = parse_region(options.region, scene)
 

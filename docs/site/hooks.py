@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 from pathlib import Path
 from typing import Any
@@ -67,4 +68,4 @@ def site_link(source: str, folder: str, target: str) -> str:
             parts.append(part)
     path = "/".join(parts)
     path = PAGES.get(path, path.removeprefix("docs/"))
-    return "../" * source.count("/") + path
+    return posixpath.relpath(path, posixpath.dirname(source) or ".")

@@ -25,7 +25,7 @@ from trainer.report.report import (
     thumbnail,
     view_caption,
 )
-from trainer.resolve import use_threads
+from trainer.resolve import prepare_process
 from trainer.run.finish import effective_texts
 from trainer.store.run_folder import write_json
 
@@ -126,7 +126,7 @@ def evaluate(options: EvaluateOptions) -> list[Evaluation]:
         ProgdfError: the folder is not a finished run, one of its files is damaged, or its scene is missing or
             differs.
     """
-    use_threads(options.threads)
+    prepare_process(options.threads)
     perceptual, warning = perceptual_loss()
     if warning:
         print_line(warning.replace("training with", "measuring with"))

@@ -40,7 +40,7 @@ class DeliveredEdit:
         return DeliveredEdit(gdf, sharpened, trajectory, remap, chosen, fitted.baselines)
 
     @property
-    def shipped(self) -> Trajectory:
+    def shipped_trajectory(self) -> Trajectory:
         """The recording on the slider of the edit."""
         return replace(self.trajectory, s=self.remap(self.trajectory.s).float())
 

@@ -506,7 +506,7 @@ class ColorEvaluator:
     targets: Sequence[Tensor]  # [h,w,3] each
 
     @cached_property
-    def _picked(self) -> list[Tensor]:
+    def _target_pixels(self) -> list[Tensor]:
         """Pixels of the targets that the views draw. [P,3] each"""
         return [view.pick(target) for view, target in zip(self.views, self.targets, strict=True)]
 
@@ -529,7 +529,7 @@ class ColorEvaluator:
         """Return the mean difference to the targets of each goal, to its power. Each view is drawn once."""
         sh = add_bands(self.views[0].members.sh, offsets)
         totals: list[Scalar] = [0.0] * len(goals)
-        pairs = list(zip(self.views, *(goal._picked for goal in goals), strict=True))
+        pairs = list(zip(self.views, *(goal._target_pixels for goal in goals), strict=True))
         for block in view_blocks(pairs):
             colors = shade([view for view, *_ in block], sh)
             items = list(zip(block, colors, strict=True))

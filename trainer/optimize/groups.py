@@ -17,7 +17,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from progdf.gaussians import attribute_slices
+from progdf.gaussians import Gaussians, attribute_slices
+from progdf.scene.bounds import scene_sphere
 from progdf.similarity import Motion, Parts, make_parts
 from trainer.motion.node_search import NodeSearch
 from trainer.motion.nodes import NodeMotion, NodePlacement, place_nodes, rest_nodes
@@ -120,6 +121,11 @@ class Groups:
             nodes = [torch.cat([n.motion.positions, n.motion.turn], dim=1) for n in self.nodes]
             state["nodes"] = torch.stack(nodes)
         return state
+
+
+def region_extent(members: Gaussians) -> float:
+    """Return the length scale of members that move on their own, world units: the diameter of the region."""
+    return 2.0 * scene_sphere(members)[1]
 
 
 def group_stage(

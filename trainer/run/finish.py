@@ -19,9 +19,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, anchor_added, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, to_json
-from progdf.rasterize import activate
 from progdf.terminal import file_size, format_count
-from progdf.threads import map_threads
 from trainer.fit.delivered import DeliveredEdit, save_delivered
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import Fitted, evaluate_field, expected_renders, fit_field, visibility
@@ -49,17 +47,16 @@ from trainer.report.measures import (
     picture_backgrounds,
 )
 from trainer.report.report import report_picture
-from trainer.resolve import BLANK, check_field_options, use_threads
-from trainer.store.memory import reuse_memory
+from trainer.resolve import BLANK, check_field_options, prepare_process
 from trainer.store.progress import RunLog
-from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
+from trainer.store.run_folder import RunFolder, read_views, write_json
 from trainer.store.state import Saved
 from trainer.views.crops import only_recolors
 from trainer.views.setup import TrainingSetup
-from trainer.views.view import View, render_view
+from trainer.views.view import View
 
 from .paint import sharpen
-from .record import FinishedRun, RunRecord, render_edited_views, reopen_run
+from .record import FinishedRun, RunRecord, render_edited_views, reopen_run, write_finals
 
 _RANK_VIEWS = 4  # number of training views on which the rank of a field is chosen
 _VISIBILITY_STRIDE = 2  # every second training view measures the visibility of the members
@@ -167,7 +164,7 @@ def finish_run(
             "report": "none",
             **figures,
             "views": _view_figures(setup, evaluator),
-            "trajectory": _trajectory_figures(edit.shipped, slider, record),
+            "trajectory": _trajectory_figures(edit.shipped_trajectory, slider, record),
             **_record_figures(record),
             "paint": paint.figures() if paint is not None else None,
             **carry_figures(setup, trajectory, record.effort, folder.behind),
@@ -175,7 +172,9 @@ def finish_run(
             "plan": to_json(options),
         }
     earlier = _earlier_seconds(folder) if log.refits else {}
-    result = replace(_deliver(folder, gdf, report, setup, paint, log, earlier), trajectory=edit.shipped)
+    result = replace(
+        _deliver(folder, gdf, report, setup, paint, log, earlier), trajectory=edit.shipped_trajectory
+    )
     if not log.refits:
         save_delivered(folder.state, edit)
         folder.state.save(RECORDED, {}, log.capture_state().values)
@@ -363,20 +362,6 @@ def _fit_field(
         return fit_field(trajectory, rank_evaluator, choosing, reporting, weights, options), None
 
 
-def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
-    """Render and write the views of the finished edit."""
-    gaussians = activate(edited)
-    with log.looks("picture the edit", len(setup.views)) as count_view:
-
-        def draw(view: View) -> tuple[str, Tensor]:
-            picture = render_view(gaussians, view.camera, setup.background)
-            count_view()
-            return view.camera.name, picture
-
-        finals = dict(map_threads(draw, setup.views))
-    write_views(folder, "final", finals)
-
-
 def _measure_paint(
     folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], edited: Gaussians
 ) -> PaintReproduction | None:
@@ -539,8 +524,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         ProgdfError: the folder is not a finished run, or its scene is missing or different.
     """
     check_field_options(options.field)
-    use_threads(options.threads)
-    reuse_memory()
+    prepare_process(options.threads)
     run = reopen_run(options.run, options.scene)
     recorded_plan = run.record.plan
     field = replace(

@@ -9,19 +9,23 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
 from progdf.io.json_values import convert_json, to_json
+from progdf.rasterize import activate
 from progdf.region import Region
+from progdf.threads import map_threads
 from trainer.methods import METHODS
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
-from trainer.store.run_folder import RunFolder, read_run_cameras, read_views
+from trainer.store.progress import RunLog
+from trainer.store.run_folder import RunFolder, read_run_cameras, read_views, write_views
 from trainer.views.setup import TrainingSetup
-from trainer.views.view import make_view, with_near_plane
+from trainer.views.view import View, make_view, render_view, with_near_plane
 
 
 @dataclass(frozen=True)
@@ -170,3 +174,17 @@ def render_edited_views(run: FinishedRun) -> TrainingSetup:
     cameras = [view.camera for view in setup.train]
     edited = {s: read_views(run.folder, "edited", cameras, s) for s in run.trajectory.strengths}
     return METHODS[run.record.plan.preset].box_views(setup, edited)
+
+
+def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
+    """Render and write the views of the finished edit."""
+    gaussians = activate(edited)
+    with log.looks("picture the edit", len(setup.views)) as count_view:
+
+        def draw(view: View) -> tuple[str, Tensor]:
+            picture = render_view(gaussians, view.camera, setup.background)
+            count_view()
+            return view.camera.name, picture
+
+        finals = dict(map_threads(draw, setup.views))
+    write_views(folder, "final", finals)

@@ -16,8 +16,7 @@ from trainer.editors import editor_row
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import TrainOptions
-from trainer.resolve import resolve, use_threads
-from trainer.store.memory import reuse_memory
+from trainer.resolve import prepare_process, resolve
 from trainer.store.pretrained import LastValueCache
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
@@ -63,8 +62,7 @@ def train(
     options = resolve(options)
     shared = shared or LastValueCache()
     check_command(options)
-    use_threads(options.threads)
-    reuse_memory()
+    prepare_process(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
     lower = open_lower_layers(shown_pictures(options), options.scene, scene)
     base = scene if lower is None else lower.base
@@ -99,7 +97,7 @@ def train(
                 return complete_report(folder.root, options.scene, quiet, request)
             if session.does == "nothing":
                 return load_result(folder, options.name, scene, log)
-            use_threads(session.threads)
+            prepare_process(session.threads)
             with check_exists(folder), folder.state.writing():
                 if session.does == "start":
                     _write_draft(options, base, region, folder, log)

@@ -40,9 +40,8 @@ from .finish import (
     load_evaluator,
     read_report,
     report_run,
-    write_finals,
 )
-from .record import RunRecord, load_recording, save_recording
+from .record import RunRecord, load_recording, save_recording, write_finals
 from .resume import picture_digests
 from .training import optimize_members, retime_trajectory
 
@@ -92,7 +91,9 @@ def train_region(
     else:
         log.say(f"{options.name} is ready; completing its report")
         request.on_delivery()
-        result = RunResult(folder, folder.gdf(options.name), read_report(folder), delivered.shipped)
+        result = RunResult(
+            folder, folder.gdf(options.name), read_report(folder), delivered.shipped_trajectory
+        )
         result = report_run(result, delivered, setup, record, perceptual, log, request.level)
     # only at the end, as a stopped run needs all views to resume
     save_cameras(folder.cameras, [view.camera for view in setup.views], setup.scene.origin)

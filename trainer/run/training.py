@@ -20,7 +20,6 @@ from progdf.io.json_values import convert_json
 from progdf.io.tensors import check_tensor
 from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
-from progdf.scene.bounds import scene_sphere
 from progdf.terminal import format_count
 from trainer.methods import METHODS
 from trainer.optimize.carry_on import CarryDecision, CarryRequest, make_tied_solver
@@ -41,7 +40,7 @@ from trainer.optimize.color_views import (
     color_views,
     draw_color_views,
 )
-from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
+from trainer.optimize.groups import Groups, group_path, group_stage, region_extent, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Perceptual, loss_table
 from trainer.optimize.pgs import SNAPSHOTS, DescentTask, OnStep, ParameterSnapshot, PgsState, TargetStage
@@ -201,7 +200,7 @@ def optimize_members(
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
-    extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
+    extent = region_extent(scene[members]) if groups is None else groups.extent
     rates = method.learning_rates(optimization.kind, original.shape[1], extent)
     if optimization.sh == "off":
         rates[BASE_CHANNELS:] = 0.0

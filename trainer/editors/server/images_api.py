@@ -3,6 +3,9 @@
 LocalAI, the server of stable-diffusion.cpp, vLLM-omni, LiteLLM and hosted services offer the same endpoint,
 `POST URL/images/edits`. The API has no strength and no starting picture, so a server makes the finished edit
 of each view. The key is read from the environment for each call. It is never stored or logged.
+
+Some hosted models accept a few sizes only, and name them when they refuse another one. Pictures then go on a
+canvas of the nearest size and are cut out again.
 """
 
 from __future__ import annotations
@@ -11,7 +14,9 @@ import base64
 import binascii
 import http.client
 import os
+import re
 import urllib.request
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +25,9 @@ from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
 
+import torch
 from torch import Tensor
+from torch.nn.functional import interpolate, pad
 
 from progdf.errors import ProgdfError
 from trainer.editors.cache import Recipe
@@ -40,11 +47,15 @@ from .calls import (
     png,
     retry_after,
 )
-from .canvas import Canvas, Size, best_canvas, named_sizes
 
 _CONNECT_TIMEOUT_S = 5.0  # wait for the answer that tells that a server is there
 _MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
+_SIZE = re.compile(r"\b(\d{2,5})\s*[x×]\s*(\d{2,5})\b")  # in the error messages of a server
 _REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
+
+
+Size = tuple[int, int]
+"""Width and height in pixels."""
 
 
 class _SizeError(Exception):
@@ -56,7 +67,67 @@ class _SizeError(Exception):
         self.sizes = sizes
 
 
-def _placed(request: PaintRequest, canvas: Canvas) -> PaintRequest:
+def named_sizes(message: str, refused: Size) -> tuple[Size, ...]:
+    """Return the sizes that an error message names, without the refused one."""
+    found = [(int(width), int(height)) for width, height in _SIZE.findall(message)]
+    return tuple(size for size in dict.fromkeys(found) if size != refused)
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """Canvas with a scaled picture in its middle."""
+
+    picture: Size
+    size: Size
+
+    @property
+    def inner(self) -> Size:
+        """Width and height of the scaled picture."""
+        scale = self._scale
+        width, height = (max(1, round(scale * side)) for side in self.picture)
+        return min(width, self.size[0]), min(height, self.size[1])
+
+    @property
+    def unused_share(self) -> float:
+        """Share of the canvas beside the picture."""
+        width, height = self.inner
+        return 1.0 - width * height / (self.size[0] * self.size[1])
+
+    @property
+    def _scale(self) -> float:
+        return min(canvas / side for canvas, side in zip(self.size, self.picture, strict=True))
+
+    def place(self, picture: Tensor) -> Tensor:
+        """Return a picture of any size on the canvas, continued by the colors of its edge. [H,W,C]"""
+        width, height = self.inner
+        left = (self.size[0] - width) // 2
+        top = (self.size[1] - height) // 2
+        scaled = _resize(picture, self.inner)
+        sides = (left, self.size[0] - width - left, top, self.size[1] - height - top)
+        return pad(scaled.permute(2, 0, 1)[None], sides, mode="replicate")[0].permute(1, 2, 0)
+
+    def cut(self, canvas: Tensor) -> Tensor:
+        """Return the picture on a canvas, at its own size. [H,W,C] -> [h,w,C]"""
+        width, height = self.inner
+        left = (self.size[0] - width) // 2
+        top = (self.size[1] - height) // 2
+        return _resize(canvas[top : top + height, left : left + width], self.picture)
+
+
+def best_canvas(picture: Size, sizes: Sequence[Size]) -> Canvas:
+    """Return the canvas with the smallest unused share; of equal ones, the first."""
+    return min((Canvas(picture, size) for size in sizes), key=lambda canvas: round(canvas.unused_share, 6))
+
+
+def _resize(picture: Tensor, size: Size) -> Tensor:
+    """Return a picture at a width and height. [H,W,C]"""
+    planes = picture.permute(2, 0, 1)[None].float()
+    if planes.shape[-2:] != (size[1], size[0]):
+        planes = interpolate(planes, (size[1], size[0]), mode="bicubic", antialias=True)
+    return torch.clamp(planes[0].permute(1, 2, 0), 0.0, 1.0)
+
+
+def _place_on_canvas(request: PaintRequest, canvas: Canvas) -> PaintRequest:
     """Return a request whose pictures are on a canvas."""
     mask = None if request.mask is None else canvas.place(request.mask[..., None])[..., 0]
     references = [canvas.place(picture) for picture in request.references]
@@ -113,7 +184,7 @@ class ImagesApi:
                 self._sizes[:] = refused.sizes
         canvas = best_canvas((width, height), self._sizes)
         try:
-            return canvas.cut(self._call(_placed(request, canvas), prompt))
+            return canvas.cut(self._call(_place_on_canvas(request, canvas), prompt))
         except _SizeError as refused:
             raise refused.error from refused
 
