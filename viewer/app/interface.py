@@ -13,12 +13,12 @@ from progdf.errors import ProgdfError
 from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
 from viewer.panel.card import BLEND_TITLES
 from viewer.pictures.compare import Labels
-from viewer.state import history, workspace
+from viewer.state import history, tour, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem, Plain
 from viewer.state.transient import Pull
 from viewer.state.workspace import Workspace
-from viewer.ui import overlay
+from viewer.ui import overlay, tour_card
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, is_changed, shortcut
 from viewer.ui.pointer import PointerContext
@@ -401,6 +401,10 @@ def over_picture(
             work = replace(work, message=None)
             if clicked == "do" and line.button is not None:
                 work = perform_actions(work, [line.button[1]], pointer)
+    if work.transient.tour is not None and view.panel:
+        bottom = min(free.y, above.height)
+        work, requested = tour_card.draw(tour.follow(work, imgui.is_any_mouse_down()), area.width, bottom, ui)
+        work = perform_actions(work, [requested] if requested is not None else [], pointer)
     if work.help:
         draw_keys(free, ui)
     return work

@@ -152,8 +152,7 @@ class MainView:
         self.wake()
 
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
-        """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
-        picture."""
+        """Set a new state and snapshots, without undo history, drag, tour or anything over the picture."""
         old = self.work.transient
         transient = replace(
             old,
@@ -164,6 +163,7 @@ class MainView:
             clone=None,
             pending=(),
             viewpoints=(),
+            tour=None,
         )
         self.store.replace(
             replace(

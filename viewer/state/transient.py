@@ -473,6 +473,14 @@ class Viewpoint:
 
 
 @dataclass(frozen=True)
+class Tour:
+    """Tour of the window, see `viewer.state.tour`."""
+
+    step: int  # index of the current step
+    before: object = field(compare=False)  # value of the step when it began
+
+
+@dataclass(frozen=True)
 class Transient:
     """Transient state of the window."""
 
@@ -494,6 +502,7 @@ class Transient:
     recent: tuple[Path, ...] = ()  # recently opened files, for menu and dialogs; the last one first
     start_files: tuple[StartFile, ...] = ()  # recently opened files, for the start page
     examples: tuple[StartFile, ...] = ()  # examples on the start page
+    tour: Tour | None = None  # the running tour
 
     @property
     def has_bar(self) -> bool:

@@ -42,7 +42,7 @@ NARROWEST_PX = 280.0  # range of the panel's width, pixels at 1×
 WIDEST_PX = 520.0
 UNSAVED = "• "
 """Prefix of the scene's name while there are unsaved changes."""
-PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
+PLACES = ("panel", "tools", "options", "view", "comparison", "timeline", "tour")
 """Parts of the window in the order of keyboard focus. Some may be hidden."""
 
 
@@ -155,6 +155,7 @@ class Layout:
     folded: tuple[str, ...] = (REGIONS_OF_EDITS,)  # folded sections of the panel
     reduced_motion: bool = False  # the camera jumps instead of gliding
     status: bool = False  # show the status line
+    toured: bool = False  # the tour was finished or skipped
 
     def with_panel(self, wide: float) -> Layout:
         """Return the layout with this panel width, in pixels at 1×, clamped and rounded."""

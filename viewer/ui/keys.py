@@ -310,6 +310,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("status", "Status line", "Shift+F1", "Splats, visible, frames per second, memory"),
         Command("full_screen", "Full screen", "F11"),
         Command("panel", "Panel", "F12", "Show or hide the panel and all overlays"),
+        Command("tour", "Show the tour", "", "Five steps: move, slide, scribble, grade, share"),
         Command("demo", "Train the demo", "", "Create a scene and train four edits: one to two minutes"),
         Command("about", "About"),
         Command("quit", "Quit", "Ctrl+Q"),

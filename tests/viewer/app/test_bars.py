@@ -17,13 +17,14 @@ from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
 from viewer.app.decal import DecalTextures
+from viewer.state import tour
 from viewer.state.commands import Plain
 from viewer.state.workspace import with_question, with_transient
 from viewer.ui.glfw_library import glfw
 
 pytestmark = pytest.mark.gl
 SIZES = {"1280x800": (1280, 800, 1.0), "800x600": (800, 600, 1.0), "scale 2": (1600, 1200, 2.0)}
-PLATES = ("message", "question", "placing", "timeline", "tools", "options", "comparison", "view")
+PLATES = ("message", "question", "placing", "timeline", "tools", "options", "comparison", "view", "tour")
 STATES = (
     *("B", "L", "P", "R", "J", "I", "Shift+M", "K", "Alt+M", "Ctrl+A", "Shift+P"),
     *("Ctrl+A Shift+P", "Ctrl+A R Shift+P", "Shift+P L", "Ctrl+A Alt+M", "Ctrl+A R Alt+M K"),
@@ -91,7 +92,7 @@ def test_no_bar_covers_another(app: App, folder: Path, size: str) -> None:
     glfw.set_window_size(app.window.handle, *points)
     first = replace(app.main_view.work, layout=replace(app.main_view.work.layout, zoom=zoom))
     buttons = [("Flip", Plain("flip_up")), ("Choose…", Plain("view_settings"))]
-    first = with_question(first, "Guessed −Y as up", buttons)
+    first = tour.start(with_question(first, "Guessed −Y as up", buttons))
     for state in STATES:
         app.main_view.store.replace(first)
         rest(app)
@@ -104,7 +105,7 @@ def test_no_bar_covers_another(app: App, folder: Path, size: str) -> None:
         shown = bars()
         display = imgui.get_io().display_size
         assert (display.x, display.y) == tuple(points)
-        assert {"tools", "question"} < set(shown), state
+        assert {"tools", "question", "tour"} < set(shown), state
         assert len({"placing", "options"} & set(shown)) <= 1, state
         for name, (left, top, right, bottom) in shown.items():
             assert min(left, top) >= 0.0, (state, name)

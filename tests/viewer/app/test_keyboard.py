@@ -10,6 +10,7 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
+from viewer.state import tour
 from viewer.state.commands import WithText
 from viewer.state.forms import DeliverOptions
 from viewer.state.workspace import PLACES, Dialog
@@ -42,7 +43,7 @@ def reach(hand: Rig, label: str, most: int = 40) -> None:
 
 
 def test_f6_cycles_through_all_visible_parts_and_the_picture(hand: Rig) -> None:
-    shown = [name for name in PLACES if name not in ("options", "timeline")]
+    shown = [name for name in PLACES if name not in ("options", "timeline", "tour")]
     for chord, names in (("F6", [*shown, ""]), ("Shift+F6", [*shown[::-1], ""])):
         for name in names:
             strike(hand, chord)
@@ -50,6 +51,8 @@ def test_f6_cycles_through_all_visible_parts_and_the_picture(hand: Rig) -> None:
             assert bool(focused()) or not name, "one sees where it is"
     strike(hand, "J")
     strike(hand, "T")
+    hand.main_view.store.replace(tour.start(hand.main_view.work))
+    hand.settle()
     for name in (*PLACES, ""):
         strike(hand, "F6")
         assert hand.main_view.work.keyboard == name

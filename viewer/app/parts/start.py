@@ -24,7 +24,7 @@ from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.panel.pages import folder_name
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
-from viewer.state import history
+from viewer.state import history, tour
 from viewer.state.transient import StartFile
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Store, with_transient
@@ -74,6 +74,7 @@ class StartActions:
         self._context = context
         self._queue = queue
         self._textures: dict[Path, moderngl.Texture | None] = {}
+        self._examples = (state_folder() / "examples").resolve()  # copies of the examples
         self._demo: Path | None = None  # its folder while it is being made
         self._added: dict[Path, tuple[Path, int]] = {}  # per edit folder: the open file and its time in ns
 
@@ -89,6 +90,7 @@ class StartActions:
     def poll(self) -> float | None:
         """Open the finished parts of the demo; return the seconds until the next poll, None for never."""
         self._publish()
+        self._offer_tour()
         if self._demo is None:
             return None
         scene = self._demo / "scene.ply"
@@ -153,12 +155,22 @@ class StartActions:
 
     def _open_example(self, bundle: str) -> None:
         """Copy the bundle into the program's state folder and open the copy, so that the user can save it."""
-        folder = state_folder() / "examples" / sha256(Path(bundle))[:8]
+        folder = self._examples / sha256(Path(bundle))[:8]
         make_folder(folder)
         copy = folder / Path(bundle).name
         if not copy.exists():
             write_file(copy, read_file(Path(bundle)))
         self._open_file(copy)
+
+    def _offer_tour(self) -> None:
+        """Start the tour in an example, unless the user has finished or skipped it before."""
+        work = self._store.get()
+        path = self._documents.get().path
+        if work.layout.toured or work.transient.tour is not None or path is None:
+            return
+        if path.is_relative_to(self._examples):
+            self._store.replace(tour.start(work))
+            self._store.wake()
 
     def _publish(self) -> None:
         """Update the files of the start page while it is open."""
