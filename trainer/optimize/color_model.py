@@ -63,5 +63,7 @@ class Model:
                 functions += f" ({self.functions:.1f} per Gaussian on average)"
             parts.append(f"residual of {functions}")
         candidates = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        rule = "smallest error" if self.hold in TIED_RIDGES else self.limits.rule
+        rule = self.limits.rule
+        if self.hold in TIED_RIDGES:  # a mask or residual that gains little here may color the members beyond
+            rule = "smallest error; with few pictures --quality sets the packing only"
         return f"{' + '.join(parts)}. Candidates, held-out dB: {candidates}. Rule: {rule}"

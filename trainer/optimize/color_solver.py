@@ -492,8 +492,8 @@ def choose_model(
     error, 5 % by default.
 
     With few pictures there is always a residual, because changes of single members would otherwise be lost.
-    The spread of the residual, with a mask and without, is the one with the smallest error. If all are equal,
-    the residual spreads to neighbors only.
+    The spread of the residual, with a mask and without, is the one with the smallest error at any quality. If
+    all are equal, the residual spreads to neighbors only.
 
     Args:
         solver: training views
