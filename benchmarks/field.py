@@ -42,7 +42,7 @@ from progdf.gdf.file import Gdf
 from progdf.metrics.image import decibels
 from progdf.rasterize import set_threads
 from progdf.threads import threads
-from trainer.evaluate.keyframes import TwoKeyframes
+from trainer.fit.keyframes import TwoKeyframes
 from trainer.optimize.color_solver import make_solver
 from trainer.optimize.color_views import add_bands
 

@@ -159,7 +159,7 @@ _PLAIN_CLAMPS = {"trainer.views.crops.clamp_towards": torch.clamp}
 
 VARIANTS = (
     Variant(BASE, "the run's own options", of=BASE),
-    Variant(LINEAR, "a straight line to the same end: 2 keyframes", linear=True),
+    Variant(LINEAR, "a straight line in raw parameters to the same end", linear=True),
     _other("one-target", "no stages: the full edit is the only target", "stages", 1),
     Variant(EQUAL, "stages at equal strengths instead of equal changes"),
     Variant("slider-stages", "the editor's own strengths, even in between", {"optimize.slider": "stages"}),

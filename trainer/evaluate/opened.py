@@ -17,11 +17,10 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.json_values import convert_json, decode_json
 from progdf.metrics.slider import Pictures
 from trainer.fit.evaluate import Evaluator
+from trainer.fit.keyframes import TwoKeyframes, closest_keyframes
 from trainer.run.finish import load_evaluator
 from trainer.run.record import FinishedRun, render_edited_views, reopen_run
 from trainer.views.setup import TrainingSetup
-
-from .keyframes import TwoKeyframes, closest_keyframes
 
 SLIDER = "slider"
 """Contender: the shipped field."""

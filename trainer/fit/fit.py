@@ -85,7 +85,7 @@ def choose_path(
     return line, f"straight: {why}"
 
 
-BASELINES = (2, 4)  # numbers of keyframes of the baseline fields
+BASELINES = (4,)  # numbers of keyframes of the stored baselines; `keyframes` holds the one of two
 _MIN_ATTRIBUTE_GAIN_DB = 0.1  # an attribute that improves the edit by less is not stored
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.choose import sample_strengths
+from progdf.field.choose import Field, sample_strengths
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf
@@ -27,6 +27,7 @@ from trainer.editors.pictures import picture_background, read_edit
 from trainer.fit.delivered import DeliveredEdit
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
+from trainer.fit.keyframes import TwoKeyframes, closest_keyframes
 from trainer.optimize.carry_on import draw_behind
 from trainer.optimize.losses import Perceptual
 from trainer.options import TextOptions
@@ -94,7 +95,7 @@ def error_curves(
 
 def against_editor(
     evaluator: Evaluator,
-    fields: Mapping[str, BakedField],
+    fields: Mapping[str, Field],
     stages: Sequence[tuple[float, float]],
     perceptual: Perceptual | None,
     most: int | None = None,
@@ -114,7 +115,7 @@ def against_editor(
 
 
 COMPARED = "keyframes2"
-"""Baseline whose curves are shown beside the field's: the most obvious alternative."""
+"""Baseline whose curves are shown beside the field's, see `closest_keyframes`."""
 
 _ROUNDING_DIFFERENCE = 1.5 / 255  # color difference of two images due to rounding to 8 bits
 REPRODUCED_SHARE = 0.9
@@ -144,6 +145,9 @@ class Measured:
 
     edit: DeliveredEdit
     shown: BakedField  # the shipped field, with the discs for fine paint if there are any
+    keyframes: TwoKeyframes  # the baseline `COMPARED`
+    # PSNR of these at `sample_strengths()` of the trajectory against the recordings, dB
+    keyframes_curve: Sequence[float]
     # slider value and strength of each set of editor pictures
     asked: Sequence[tuple[float, float]]
     slider: SliderStatistics  # uniformity and monotonicity of the slider
@@ -157,7 +161,9 @@ class Measured:
 
 def measure(
     judges: tuple[Evaluator, Evaluator],
+    setup: TrainingSetup,
     edit: DeliveredEdit,
+    is_even: bool,
     perceptual: Perceptual | None,
     clip: Direction,
 ) -> Measured:
@@ -165,7 +171,9 @@ def measure(
 
     Args:
         judges: evaluators of all held-out views, and of those on which the field was not chosen
+        setup: training views, with the Gaussians that the edit adds
         edit: the edit as delivered
+        is_even: True if equal steps of the slider change the pictures equally
         perceptual: see `error_curves`
         clip: finished CLIP measurement, or the reason if there is none
     """
@@ -173,23 +181,23 @@ def measure(
     trajectory = edit.trajectory
     shipped = edit.gdf.field
     remap = edit.remap
-    linear = edit.baselines[COMPARED].field
     slider = slider_statistics(evaluator.course(shipped), masks=evaluator.pixels)
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
-    drawn = against_editor(evaluator, {"slider": shipped, COMPARED: linear}, stages, perceptual, most=1)
+    keyframes = closest_keyframes(shipped, setup, evaluator, stages, is_even)
+    drawn = against_editor(evaluator, {"slider": shipped, COMPARED: keyframes}, stages, perceptual, most=1)
+
+    def recorded_psnr(field: Field, s: float) -> float:
+        return reporting.psnr(
+            reporting.pictures(field.offsets(remap.at(s))), reporting.pictures(trajectory.at(s))
+        )
+
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _RECORDING_SAMPLES))].tolist()
-    worst = min(
-        (
-            reporting.psnr(
-                reporting.pictures(shipped.offsets(remap.at(s))), reporting.pictures(trajectory.at(s))
-            )
-            for s in nodes
-        ),
-        default=edit.chosen.worst,
-    )
+    worst = min((recorded_psnr(shipped, s) for s in nodes), default=edit.chosen.worst)
     return Measured(
         edit,
         shipped,
+        keyframes,
+        keyframes_curve=[recorded_psnr(keyframes, s) for s in sample_strengths()],
         asked=stages,
         slider=slider,
         at_recordings=worst,
@@ -202,7 +210,8 @@ def measure(
 
 def expected_measures(trajectory: Trajectory) -> int:
     """Return the approximate number of renders of all views by `measure`, for a progress bar."""
-    return 30 + 2 * len(trajectory.stage_strengths) + 2 * _RECORDING_SAMPLES
+    samples = _RECORDING_SAMPLES + len(sample_strengths())
+    return 30 + 4 * len(trajectory.stage_strengths) + 2 * samples
 
 
 def clip_curve(
@@ -299,8 +308,18 @@ def measured_figures(measured: Measured) -> dict[str, Any]:
         edit["clip_model"] = measured.clip.model
     else:
         edit["clip_reason"] = measured.clip.reason
+    keyframes = measured.keyframes
+    curve = measured.keyframes_curve
     return {
         "field": {"psnr_at_recordings": round(measured.at_recordings, 2)},
+        "baselines": {
+            COMPARED: {
+                "kind": "oklab" if keyframes.in_oklab else "raw",
+                "bytes_per_gaussian": round(keyframes.bytes_per_member, 1),
+                "psnr_mean": round(sum(curve) / len(curve), 2),
+                "psnr_worst": round(min(curve), 2),
+            }
+        },
         "edit": edit,
         "slider": {
             "monotone": slider.monotone,
@@ -318,7 +337,7 @@ def measured_figures(measured: Measured) -> dict[str, Any]:
             "against_trajectory": {
                 "s": [_round4(delivered.remap.at(s)) for s in sample_strengths()],
                 "slider": [round(psnr, 2) for psnr in delivered.chosen.curve],
-                COMPARED: [round(psnr, 2) for psnr in delivered.baselines[COMPARED].curve],
+                COMPARED: [round(psnr, 2) for psnr in measured.keyframes_curve],
             },
             "against_editor": {name: found.to_json() for name, found in measured.editor.items()},
             "change": {

@@ -9,8 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from progdf.field import BakedField
-from progdf.field.choose import sample_strengths
+from progdf.field.choose import Field, sample_strengths
 from progdf.io.images import contact_sheet, to_picture
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Losses
@@ -45,14 +44,13 @@ def report_picture(
         held_out: number of held-out views among the evaluated ones
     """
     chosen = measured.shown
-    linear = measured.edit.baselines[COMPARED].field
     columns = columns_of(measured.asked)
     sheet = to_picture(
         contact_sheet(
             [
                 strip(shown, chosen, columns),
                 editor_strip(evaluator, columns),
-                strip(evaluator, linear, columns),
+                strip(evaluator, measured.keyframes, columns),
             ],
             ["slider", "the editor", "2 keyframes"],
             [column_heading(*column) for column in columns],
@@ -94,7 +92,7 @@ def columns_of(stages: Sequence[tuple[float, float]]) -> Columns:
 
 
 def strip(
-    evaluator: Evaluator, field: BakedField, columns: Columns, width: int = _THUMBNAIL_WIDTH
+    evaluator: Evaluator, field: Field, columns: Columns, width: int = _THUMBNAIL_WIDTH
 ) -> list[Tensor]:
     """Draw the best view at the columns' slider values, as thumbnails of one size."""
     best = best_view(evaluator)
@@ -129,6 +127,8 @@ def _error_plots(measured: Measured) -> list[Plot]:
         f"{_label(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
         for name, found in fields.items()
     }
+    name = f"{_label(COMPARED)}, {measured.keyframes.bytes_per_member:.0f} B"
+    recorded[name] = (s, measured.keyframes_curve)
     plots = [Plot("PSNR to the recorded trajectory, dB", recorded, "slider", span=_SPAN)]
     if len(measured.asked) > 1:
         edited = {_label(name): (curve.s, curve.psnr) for name, curve in measured.editor.items()}

@@ -209,10 +209,10 @@ def report_run(
     if level == "none":
         return result
     options = record.plan
+    grown = setup.extend(edit.trajectory.added)
+    is_even = resolve_slider(options.optimize.slider, edit.trajectory.strengths) == "even"
     if views is None:
-        plain = load_evaluator(
-            result.folder, setup.extend(edit.trajectory.added), setup.judging, edit.trajectory
-        )
+        plain = load_evaluator(result.folder, grown, setup.judging, edit.trajectory)
         sharp = edit.sharpened
         views = plain, plain
         if sharp is not None:
@@ -230,7 +230,7 @@ def report_run(
         with log.looks("measure the edit", expected_measures(edit.trajectory)) as count_view:
             _, reporting = evaluator.halves()
             judges = replace(evaluator, looked=count_view), replace(reporting, looked=count_view)
-            measured = measure(judges, edit, distance, clip)
+            measured = measure(judges, grown, edit, is_even, distance, clip)
         if edit.sharpened is not None:
             field = edit.sharpened.field
             slider_measures = against_editor(displayed, {"slider": field}, measured.asked, distance, most=1)
@@ -389,8 +389,8 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
 
 
 def _with_measures(report: Mapping[str, Any], measures: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a report with further figures; those of the field and the edit are added to its own."""
-    joined = {name: {**report[name], **measures[name]} for name in ("field", "edit")}
+    """Return a report with further figures; field, edit and baselines keep their own and gain these."""
+    joined = {name: {**report[name], **measures[name]} for name in ("field", "edit", "baselines")}
     return {**report, **measures, **joined}
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field import FieldEvaluator, fit_keyframes
+from progdf.field import FieldEvaluator
 from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
@@ -24,6 +24,8 @@ from progdf.gdf.file import load_gdf, read_gdf
 from tests.helpers.trained import quick_options, train
 from trainer import cli
 from trainer.evaluate.command import evaluate
+from trainer.evaluate.opened import open_run
+from trainer.fit.fit import fit_baselines
 from trainer.options import EvaluateOptions, FitOptions, TrainOptions, with_values
 from trainer.report.plots import LINES, draw_plot
 from trainer.resolve import resolve
@@ -74,6 +76,16 @@ def test_slider_is_closer_to_the_editor_than_two_keyframes(done: RunResult) -> N
     assert len(done.report["between"]) == 3
     for s, between in done.report["between"].items():
         assert between["psnr"] > between["keyframes2"] + 4.0, s
+
+
+def test_report_compares_with_the_keyframes_of_the_evaluation(done: RunResult) -> None:
+    opened = open_run(done.folder.root)
+    baseline = done.report["baselines"]["keyframes2"]
+    assert baseline["kind"] == ("oklab" if opened.keyframes.in_oklab else "raw")
+    pictures = opened.evaluator.course(opened.keyframes)
+    for s, between in done.report["between"].items():
+        psnr = opened.evaluator.psnr(pictures(float(s)), opened.evaluator.edited[between["strength"]])
+        assert between["keyframes2"] == pytest.approx(psnr, abs=0.02)  # s has 4 digits
 
 
 @pytest.mark.slow
@@ -178,6 +190,7 @@ def test_report_has_its_documented_keys(done: RunResult) -> None:
         assert keys <= set(report[part]), part
     assert report["memory_mb"] > 0
     assert report["field"]["psnr_worst"] >= 40.0
+    assert set(report["baselines"]["keyframes4"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
     assert set(report["baselines"]["keyframes2"]) >= {"psnr_mean", "psnr_worst", "bytes_per_gaussian"}
 
 
@@ -192,12 +205,12 @@ def test_field_errors_are_reported_on_views_unseen_by_the_choice(done: RunResult
     setup = render_run_views(run)
     halves = load_evaluator(run.folder, setup, setup.held_out, trajectory).halves()
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    linear = fit_keyframes(trajectory.s, offsets, 2)
+    field = fit_baselines(trajectory)["keyframes4"]
     chosen, reported = (
-        min(FieldEvaluator(trajectory.s, offsets, half.counted_pixels).curve(linear)) for half in halves
+        min(FieldEvaluator(trajectory.s, offsets, half.counted_pixels).curve(field)) for half in halves
     )
     assert abs(chosen - reported) > 0.02
-    assert report["baselines"]["keyframes2"]["psnr_worst"] == pytest.approx(reported, abs=0.006)
+    assert report["baselines"]["keyframes4"]["psnr_worst"] == pytest.approx(reported, abs=0.006)
     tried = {t["field"]: t["psnr_worst"] for t in report["choice"]["tried"]}
     assert tried[report["choice"]["chosen"]] != report["field"]["psnr_worst"]
 

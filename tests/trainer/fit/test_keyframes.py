@@ -7,7 +7,7 @@ from progdf.color.oklab import srgb_to_oklab
 from progdf.field import fit_keyframes
 from progdf.field.baked import SliderRemap
 from progdf.sh import C0
-from trainer.evaluate.keyframes import TwoKeyframes
+from trainer.fit.keyframes import TwoKeyframes
 
 
 def test_oklab_keyframes_match_raw_ends_and_are_straight_between() -> None:

@@ -18,9 +18,10 @@ from progdf.field import BakedField
 from progdf.field.baked import SliderRemap, identity_remap
 from progdf.field.grade import member_bands, sphere
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
-from trainer.fit.evaluate import Evaluator
-from trainer.fit.slider_uniformity import equalizing_slider
 from trainer.views.setup import TrainingSetup
+
+from .evaluate import Evaluator
+from .slider_uniformity import equalizing_slider
 
 
 @dataclass(frozen=True)
