@@ -47,6 +47,17 @@ def _text_check(check: Callable[[str], object]) -> Callable[[str, EditorOptions]
 
 _check_paint = _text_check(paint_of)
 
+_SERVER_OPTIONS = (
+    "api_url",
+    "degrees",
+    "price_per_call",
+    "yes",
+    "anchor",
+    "edit_size",
+    "edit_workers",
+    "edit_timeout",
+)  # options of the editors whose model a server runs
+
 EDITORS = {
     "recolor": EditorRow(recolor, "recolor:#3060d0", _check_paint, color_function=True, is_parallel=True),
     "tint": EditorRow(tint, "tint:#d4af37", _check_paint, color_function=True, is_parallel=True),
@@ -159,19 +170,7 @@ EDITORS = {
         slow_strengths=True,
         sends_pictures=True,
         image_size=IMAGE_SIZE,
-        options=(
-            "model",
-            "api_url",
-            "api_references",
-            "api_mask",
-            "degrees",
-            "price_per_call",
-            "yes",
-            "anchor",
-            "edit_size",
-            "edit_workers",
-            "edit_timeout",
-        ),
+        options=("model", "api_references", "api_mask", *_SERVER_OPTIONS),
         remedy="make the prompt more specific, or use --kind geometry if parts move",
     ),
     "comfy": EditorRow(
@@ -183,17 +182,7 @@ EDITORS = {
         slow_strengths=True,
         sends_pictures=True,
         image_size=IMAGE_SIZE,
-        options=(
-            "prompt",
-            "api_url",
-            "degrees",
-            "price_per_call",
-            "yes",
-            "anchor",
-            "edit_size",
-            "edit_workers",
-            "edit_timeout",
-        ),
+        options=("prompt", *_SERVER_OPTIONS),
         remedy="make the prompt more specific, or use --kind geometry if parts move",
     ),
     "remove": EditorRow(

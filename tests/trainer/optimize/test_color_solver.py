@@ -48,16 +48,19 @@ def orbit(count: int, size: int) -> list[Camera]:
     return cameras
 
 
-def dense_ball(count: int = 3000, bands: int = 0) -> Gaussians:
-    """Return a ball of many small Gaussians in random colors."""
+def dense_ball(
+    count: int = 3000, bands: int = 0, scale: float = 0.05, colors: tuple[float, float] = (0.2, 0.8)
+) -> Gaussians:
+    """Return a ball of many Gaussians of one scale in random colors of a range."""
+    low, high = colors
     rng = torch.Generator().manual_seed(3)
     means = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
     return Gaussians(
         means,
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-        torch.full((count, 3), 0.05).log(),
+        torch.full((count, 3), scale).log(),
         torch.full((count,), 2.0),
-        rgb_to_sh0(0.2 + 0.6 * torch.rand(count, 3, generator=rng)),
+        rgb_to_sh0(low + (high - low) * torch.rand(count, 3, generator=rng)),
         0.1 * torch.randn(count, bands, 3, generator=rng),
     )
 

@@ -14,9 +14,8 @@ from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import set_threads
 from progdf.rasterize.cpu.weights import ListedWeights
 from progdf.rasterize.sparse import weights_of_entries
-from progdf.sh import rgb_to_sh0
 from tests.helpers.card import CARD, Card
-from tests.trainer.optimize.test_color_solver import orbit
+from tests.trainer.optimize.test_color_solver import dense_ball, orbit
 from trainer.optimize import color_kernels, color_tensors
 from trainer.optimize.color_solver import Solver, choose_model, make_solver
 from trainer.optimize.color_views import ColorEvaluator, ColorMembers, ColorView, add_bands, color_views
@@ -26,16 +25,8 @@ STEPS = 6
 
 
 def ball(count: int = 400, bands: int = 8) -> Gaussians:
-    rng = torch.Generator().manual_seed(3)
-    means = torch.nn.functional.normalize(torch.randn(count, 3, generator=rng), dim=1)
-    return Gaussians(
-        means,
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-        torch.full((count, 3), 0.12).log(),
-        torch.full((count,), 2.0),
-        rgb_to_sh0(-0.1 + 1.2 * torch.rand(count, 3, generator=rng)),
-        0.1 * torch.randn(count, bands, 3, generator=rng),
-    )
+    """Return a ball of overlapping Gaussians, some with colors beyond the range of a screen."""
+    return dense_ball(count, bands, scale=0.12, colors=(-0.1, 1.1))
 
 
 def recolored(scene: Gaussians) -> Gaussians:
