@@ -388,11 +388,9 @@ def entry(title: str, line: str, chosen: bool, color: Rgba, ui: UiContext) -> bo
     wide = max(name.x, below.x)
     tall = name.y + below.y + 2 * pad
     x, y = imgui.get_cursor_screen_pos()
+    imgui.dummy((wide, tall))  # a selectable is as wide as its list, and does not widen it
+    imgui.set_cursor_screen_pos((x, y))
     pressed = imgui.selectable(f"##{title}", chosen, 0, (0.0, tall))[0]
-    if imgui.get_item_rect_max().x - x < wide:  # a selectable is as wide as its list, and does not widen it
-        imgui.same_line(0.0, 0.0)
-        imgui.set_cursor_screen_pos((x, y))
-        imgui.dummy((wide, tall))
     canvas = imgui.get_window_draw_list()
     canvas.add_text((x, round(y + pad)), u32(color), title)
     with imgui_ctx.push_font(None, SMALL_PX):

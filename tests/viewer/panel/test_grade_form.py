@@ -19,10 +19,10 @@ COLORS = ("#7eae44", "#b97a30", "#a09a90")
 FORM = NewEdit(
     editor=next(i for i, editor in enumerate(EDITORS) if editor.kind == "grade"),
     palette=tuple((color, color) for color in COLORS),
-    folded=("Light", "Color", "Palette", "Wheels"),
+    folded=("Looks", "Light", "Color", "Palette", "Wheels"),
 )
-SWATCH_Y = 296.0  # with an open palette
-CURVE_TOP = 376.0  # of a curve below folded sections
+SWATCH_Y = 397.0  # with an open palette
+CURVE_TOP = 477.0  # of a curve below folded sections
 LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
 
 
@@ -85,7 +85,8 @@ def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> No
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
     hand.main_view.store.replace(
         replace(
-            hand.main_view.work, form=replace(form(hand), palette=moved, folded=("Light", "Color", "Curve"))
+            hand.main_view.work,
+            form=replace(form(hand), palette=moved, folded=("Looks", "Light", "Color", "Curve")),
         )
     )
     hand.frame(2)
@@ -116,11 +117,11 @@ def test_picking_a_color_adds_it_to_the_palette_only(hand: Rig) -> None:
 
 
 def test_wheel_follows_a_drag_and_a_double_click_resets_it(hand: Rig) -> None:
-    opened = replace(FORM, folded=("Light", "Color", "Palette", "Curve"))
+    opened = replace(FORM, folded=("Looks", "Light", "Color", "Palette", "Curve"))
     hand.main_view.store.replace(replace(hand.main_view.work, form=opened))
     hand.frame(2)
     wide = (WINDOW[0] - 22.0 - (LEFT - 10.0 - new_edit_form.COLUMN_PX) - 16.0) / 3
-    center = LEFT - new_edit_form.COLUMN_PX + wide / 2, 330.0 + wide / 2
+    center = LEFT - new_edit_form.COLUMN_PX + wide / 2, 431.0 + wide / 2
     hand.drag((center[0] - 20.0, center[1]), (center[0], center[1] - 0.25 * wide))
     shadows, midtones, _ = form(hand).wheels
     assert shadows.hue == pytest.approx(90.0, abs=15.0)
