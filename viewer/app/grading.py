@@ -128,7 +128,10 @@ class GradePreview:
     def _update_shelf(self) -> None:
         """Read the looks, and draw their thumbnails after the view or the looks have changed."""
         if self._looks is None:
-            self._looks = (*user_files.read_looks(), *BUILT_IN.items())
+            self._looks = (
+                *user_files.read_looks(),
+                *((name, f"grade:{settings}") for name, settings in BUILT_IN.items()),
+            )
         sample = self._grader.sample
         if sample is None:
             if self._store.get().transient.shelf.looks != self._looks:
@@ -174,13 +177,21 @@ class GradePreview:
         self._messages.show(f"Saved the look {look_name(path.stem)} as {path}")
         self._store.wake()
 
-    def _copy(self, _: None) -> None:
-        """Copy the settings of the form's edit, or of the selected layer's, as text."""
+    def _copy(self, index: int | None) -> None:
+        """Copy the settings of an edit as text.
+
+        Args:
+            index: its layer; None for the open form, or else the focused layer
+
+        Raises:
+            ProgdfError: the layer has no settings.
+        """
         work = self._store.get()
         settings = work.form.spec
-        if not work.form_open:
+        if index is not None or not work.form_open:
             edits = self._documents.get().edits
-            layer = None if work.focus is None else work.view.layers[work.focus]
+            index = work.focus if index is None else index
+            layer = None if index is None else work.view.layers[index]
             settings = "" if layer is None or layer.gdf >= len(edits) else edits[layer.gdf].instruction
         if not settings:
             raise ProgdfError("select a layer that was trained, or open the form; then copy its settings")

@@ -23,7 +23,7 @@ from progdf.formats import cube
 from progdf.io.atomic import atomic_write, make_folder, state_folder
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.json_values import read_json, to_json
-from viewer.state.forms import OutsideSettings
+from viewer.state.forms import CUBE_LOOK, OutsideSettings
 from viewer.state.workspace import Layout
 
 from .session import session_of
@@ -112,17 +112,19 @@ def looks_folder() -> Path:
 
 
 def read_looks() -> tuple[tuple[str, str], ...]:
-    """Return name and grade of each of the user's looks, in the order of their names.
+    """Return name and editor of each of the user's looks, in the order of their names.
 
-    A look is a .cube file whose comment has its settings. Other files are left out.
+    A .cube file whose comment has settings is a grade, as "grade:SETTINGS". Another one is "cube:FILE".
     """
     looks = []
     with contextlib.suppress(OSError):
         for path in sorted(looks_folder().glob(f"*{cube.SUFFIX}")):
             with contextlib.suppress(OSError, ProgdfError):
                 settings = cube.read_settings(path)
-                parse_grade(settings)
-                looks.append((look_name(path.stem), settings))
+                if settings:
+                    parse_grade(settings)
+                look = f"grade:{settings}" if settings else f"{CUBE_LOOK}{path}"
+                looks.append((look_name(path.stem), look))
     return tuple(looks)
 
 

@@ -126,11 +126,14 @@ BLEND_HELP = {
 _BUSY = ("queued", "running", "stopping")  # states of a job that will fill a hole
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
-    *("rename", "duplicate", "replace", "again", "", "remove", ""),
+    *("rename", "duplicate", "replace", "again", "copy_edit", "paste_edit", "", "remove", ""),
     *("limit_to_selection", "select_painted", "", "reset", ""),
     *("group", "set_blend", "select_layers", "reset_all"),
 )
-_LAYER_ACTIONS = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
+_LAYER_ACTIONS = (
+    *("rename", "duplicate", "replace", "again", "copy_edit", "remove"),
+    *("limit_to_selection", "select_painted"),
+)
 """Actions that receive the layer's index. All other actions of the menu apply to the selected layers."""
 
 
@@ -288,6 +291,8 @@ def _menu(
         off = []
         if is_open and with_settings(NewEdit(), row.instruction) is None:
             off.append("again")
+        if not row.instruction:
+            off.append("copy_edit")
         if not state.selection.count:
             off.append("limit_to_selection")
         for action in _MENU_ITEMS if is_open else ():

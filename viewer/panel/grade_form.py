@@ -16,7 +16,9 @@ from progdf.color.oklab import fit_gamut, hue_of, srgb_to_oklab
 from progdf.color.palette import Curve, bend_lightness, with_highlights
 from progdf.color.tone import WHEELS, Wheel
 from viewer.render.live_grade import BLACK_MARK, WHITE_MARK
+from viewer.state.commands import Action, Plain, WithText
 from viewer.state.forms import (
+    CUBE_LOOK,
     LOOK_COLUMNS,
     LOOK_PX,
     NO_CURVES,
@@ -74,15 +76,19 @@ _NAMES = tuple(GRADE_RANGES)
 
 
 def draw(
-    form: NewEdit, scope: GradeScope, shelf: LookShelf, column: float, ui: UiContext
-) -> tuple[NewEdit, str]:
-    """Draw the sections of a grade; return the changed form and a requested action, "" for none."""
+    form: NewEdit,
+    scope: GradeScope,
+    shelf: LookShelf,
+    column: float,
+    ui: UiContext,
+    actions: list[Action],
+) -> NewEdit:
+    """Draw the sections of a grade; return the changed form. `actions` receives the requested actions."""
     form = _histogram(form, scope, ui)
     form = replace(form, hovered_look="")
-    action = ""
     form, is_open = _section("Looks", form, False, ui)
     if is_open:
-        form, action = _looks(form, shelf, ui)
+        form = _looks(form, shelf, ui, actions)
     form, is_open = _section("Light", form, _is_changed(form, _LIGHT), ui)
     if is_open == "reset":
         form = _reset(form, _LIGHT)
@@ -109,7 +115,7 @@ def draw(
         form = replace(form, curves=NO_CURVES)
     elif is_open:
         form = _curves(form, column, ui)
-    return form, action
+    return form
 
 
 def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
@@ -148,11 +154,10 @@ def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
     return form
 
 
-def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext) -> tuple[NewEdit, str]:
+def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext, actions: list[Action]) -> NewEdit:
     """Draw the looks; the picture shows the one under the pointer, and a press applies it.
 
-    Returns:
-        the form, and "save_look" if its grade is to be saved, else ""
+    A color table without settings becomes a layer, as the form has no settings for it.
     """
     gap = 2.0 * ui.scale
     wide = (imgui.get_content_region_avail().x - (LOOK_COLUMNS - 1) * gap) / LOOK_COLUMNS
@@ -178,15 +183,20 @@ def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext) -> tuple[NewEdit, str
                 at = (low.x + 3.0 * ui.scale, low.y + 3.0 * ui.scale)
                 canvas.add_text(at, u32(PALETTE.dim), elide(name, wide - 6.0 * ui.scale))
         if imgui.is_item_hovered():
-            form = replace(form, hovered_look=f"grade:{look}")
+            form = replace(form, hovered_look=look)
             canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
-        tip(name)
-        if pressed:
+        is_table = look.startswith(CUBE_LOOK)
+        tip(f"{name}: a color table, which becomes a layer" if is_table else name)
+        if pressed and is_table:
+            actions.append(WithText("open_file", look.removeprefix(CUBE_LOOK)))
+        elif pressed:
             form = with_look(form, look)
     with inert(form.spec == "grade"):
         saves = imgui.button("Save as a look", imgui.ImVec2(-1.0, 0.0))
     tip("Keep this grade under the edit's name, as a .cube file that other programs read too")
-    return form, "save_look" if saves else ""
+    if saves:
+        actions.append(Plain("save_look"))
+    return form
 
 
 def _section(name: str, form: NewEdit, changed: bool, ui: UiContext) -> tuple[NewEdit, str]:

@@ -69,7 +69,7 @@ def draw(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> W
         if closes:  # skip the fields, which would undo the typing
             actions.append(Plain("new_edit"))
         else:
-            form, action = _content(work, count, ui)
+            form, action = _content(work, count, ui, actions)
             if trains:
                 action = "train"
             if action:
@@ -90,7 +90,7 @@ def has_keyboard() -> bool:
     return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
-def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
+def _content(work: Workspace, count: int, ui: UiContext, actions: list[Action]) -> tuple[NewEdit, str]:
     """Draw the form; return the changed form and the requested action.
 
     The action is "train", "paint_over", "new_edit" to close the form, or "" for none.
@@ -111,8 +111,7 @@ def _content(work: Workspace, count: int, ui: UiContext) -> tuple[NewEdit, str]:
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
     if form.choice.setting == "grade":
-        form, requested = grade_form.draw(form, work.transient.scope, work.transient.shelf, column, ui)
-        action = action or requested
+        form = grade_form.draw(form, work.transient.scope, work.transient.shelf, column, ui, actions)
     else:
         form = _settings(form, preview, column, ui)
     if form.choice.has_anchor:

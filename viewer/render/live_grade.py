@@ -16,13 +16,15 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.color.grade import ColorGrade, grade_course, grade_fully, measure_grade, parse_grade
+from progdf.color.oklab import STRAIGHT, color_path
 from progdf.errors import ProgdfError
 from progdf.field.baked import lattice_colors
 from progdf.field.grade import look_up
+from progdf.formats.cube import read_cube
 from progdf.gaussians import Gaussians
 from progdf.sh import C0, basis
 from viewer.jobs.preview_process import RegionSample
-from viewer.state.forms import NewEdit
+from viewer.state.forms import CUBE_LOOK, NewEdit
 from viewer.state.transient import GradeScope
 
 SIDE = 33
@@ -40,11 +42,13 @@ class LiveGrade:
     grade: ColorGrade  # with its measured palette
     strength: float = 1.0  # 0 to 1
     marks: bool = False  # show clipped colors: white in red, black in blue
+    table: Tensor | None = None  # color table instead of the grade, see `look_up`. [side³,3]
 
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, LiveGrade)
             and self.rows is other.rows
+            and self.table is other.table
             and self.grade is other.grade
             and (self.strength, self.marks) == (other.strength, other.marks)
         )
@@ -96,6 +100,10 @@ class ColorTable:
 
 def _at_strength(colors: Tensor, live: LiveGrade) -> Tensor:
     """Return the colors at the strength of the grade. [...,3] -> [...,3]"""
+    if live.table is not None:
+        flat = colors.reshape(-1, 3)
+        full = look_up(flat.T, live.table).T.reshape(colors.shape).clamp(0.0, 1.0)
+        return color_path(colors, full, STRAIGHT)(live.strength)
     if live.strength == 1.0:
         return grade_fully(colors, live.grade)
     return grade_course(colors, live.grade)(live.strength)
@@ -208,7 +216,7 @@ class FormGrader:
         sample = self.sample
         if sample is None or self.rows is None:
             return None
-        live = self._new(f"grade:{look}", self.rows)
+        live = self._new(look, self.rows)
         inside = torch.from_numpy(sample.inside).clamp(0.0, 1.0)
         change = torch.zeros_like(inside) if live is None else _at_strength(inside, live) - inside
         pixels = torch.from_numpy(sample.image) + torch.from_numpy(sample.mask)[..., None] * change
@@ -216,8 +224,10 @@ class FormGrader:
         return thumbnail
 
     def _new(self, spec: str, rows: NDArray[np.int64]) -> LiveGrade | None:
-        """Return the grade of a form's editor; None if it changes nothing."""
+        """Return the grade of a form's editor, or a color table; None if it changes nothing."""
         try:
+            if spec.startswith(CUBE_LOOK):
+                return LiveGrade(rows, ColorGrade(), table=read_cube(spec.removeprefix(CUBE_LOOK)))
             grade = parse_grade(spec.partition(":")[2])
         except ProgdfError:
             return None

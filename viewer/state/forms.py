@@ -42,6 +42,8 @@ SHEET_COLUMNS = 6
 
 LOOK_PX = (96, 72)
 """Width and height of a look's thumbnail, in pixels."""
+CUBE_LOOK = "cube:"
+"""Prefix of a look that is the color table of a .cube file, without settings."""
 LOOK_COLUMNS = 4
 """Number of thumbnails in a row of their sheet."""
 
@@ -393,7 +395,7 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
 
 def with_look(form: NewEdit, look: str) -> NewEdit:
     """Return the form with a look's grade. The palette becomes unchanged unless the look has one."""
-    changed = with_settings(form, f"grade:{look}")
+    changed = with_settings(form, look)
     if changed is None:
         return form
     palette = changed.palette or tuple((source, source) for source, _ in form.palette)

@@ -57,7 +57,7 @@ class GradeScope(NamedTuple):
 class LookShelf(NamedTuple):
     """Looks of the form, and their thumbnails."""
 
-    looks: tuple[tuple[str, str], ...] = ()  # name and grade of each
+    looks: tuple[tuple[str, str], ...] = ()  # name and editor of each, see `user_files.read_looks`
     sheet: int = 0  # GL name of the texture with their thumbnails, 0 for none
 
 

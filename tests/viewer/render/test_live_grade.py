@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from progdf.color.grade import ColorGrade, grade_fully, parse_grade
+from progdf.color.grade import ColorGrade, grade_course, grade_fully, parse_grade
 from progdf.color.looks import BUILT_IN
 from progdf.field.baked import lattice_colors
+from progdf.field.grade import look_up
 from progdf.formats.cube import SIDE as CUBE_SIDE
 from progdf.formats.cube import read_cube, read_settings, write_cube
 from tests.helpers.ui_rig import bear
 from viewer.camera.view_camera import first_camera, to_camera
+from viewer.files import user_files
 from viewer.jobs.preview_process import RegionSample
 from viewer.render import live_grade
 from viewer.render.engine import ViewEngine
@@ -75,7 +77,7 @@ def test_lattice_of_used_points_equals_the_whole_lattice(monkeypatch: pytest.Mon
     monkeypatch.setattr(live_grade, "SIDE", 9)
     few = ColorTable(colors).apply(live)
     table = grade_fully(lattice_colors(9).float(), GRADE)
-    assert torch.allclose(few, live_grade.look_up(colors.T, table).T, atol=1e-6)
+    assert torch.allclose(few, look_up(colors.T, table).T, atol=1e-6)
     assert (few - exact).abs().mean() < 0.02
 
 
@@ -131,7 +133,9 @@ def test_form_is_graded_before_its_sample_has_arrived() -> None:
 
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_looks_are_grades_that_keep_the_palette(name: str) -> None:
-    form = with_look(replace(FORM, palette=(("#7eae44", "#4474ae"),), region="selection"), BUILT_IN[name])
+    form = with_look(
+        replace(FORM, palette=(("#7eae44", "#4474ae"),), region="selection"), f"grade:{BUILT_IN[name]}"
+    )
     assert parse_grade(form.spec.partition(":")[2]).values == parse_grade(BUILT_IN[name]).values
     assert form.palette == (("#7eae44", "#7eae44"),)
     assert form.region == "selection"
@@ -142,3 +146,30 @@ def test_look_files_keep_their_settings(tmp_path: Path) -> None:
     write_cube(tmp_path / "a.cube", table, "a", "exposure=0.40")
     assert read_settings(tmp_path / "a.cube") == "exposure=0.40"
     assert torch.allclose(read_cube(tmp_path / "a.cube"), table, atol=1e-5)
+
+
+def test_tables_of_other_programs_are_looks_and_keep_half_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(user_files, "looks_folder", lambda: tmp_path)
+    table = grade_fully(lattice_colors(CUBE_SIDE).float(), GRADE)
+    write_cube(tmp_path / "film.cube", table, "film")
+    write_cube(tmp_path / "own.cube", table, "own", "exposure=0.40")
+    (tmp_path / "broken.cube").write_text("LUT_1D_SIZE 2")
+    looks = dict(user_files.read_looks())
+    assert looks["own"] == "grade:exposure=0.40"
+    assert with_look(FORM, looks["film"]) == FORM, "the form has no settings for it"
+    grader = FormGrader()
+    colors = torch.rand(40, 3, generator=torch.Generator().manual_seed(1))
+    grader.sample = sample_of(colors)
+    grader.rows = np.arange(len(colors))
+    live = grader.live(replace(FORM, hovered_look=looks["film"]))
+    assert live is not None
+    graded = ColorTable(colors).apply(live)
+    assert torch.allclose(graded, grade_fully(colors, GRADE), atol=0.01), "as of its lattice"
+    half = ColorTable(colors).apply(replace(live, strength=0.5))
+    assert torch.allclose(half, grade_course(colors, GRADE)(0.5), atol=0.02)
+    shown = grader.thumbnail(looks["film"])
+    assert shown is not None
+    assert np.abs(shown.reshape(-1, 3) / 255.0 - graded[:12].numpy()).max() < 0.01
+    assert grader.thumbnail(looks["broken"]) is not None, "an unreadable table shows the view unchanged"
