@@ -259,12 +259,12 @@ def _wheels(form: NewEdit, ui: UiContext) -> NewEdit:
     """Draw the discs of shadows, midtones and highlights, each with its slider of lightness below."""
     gap = 8.0 * ui.scale
     wide = math.floor((imgui.get_content_region_avail().x - 2 * gap) / 3)
+    left = imgui.get_cursor_pos_x()
     top = imgui.get_cursor_pos_y()
     wheels = []
     for i, (name, wheel) in enumerate(zip(WHEELS, form.wheels, strict=True)):
-        if i:
-            imgui.same_line(0.0, gap)
-            imgui.set_cursor_pos_y(top)  # not at the baseline of the text beside it
+        # not `same_line`, which aligns the names with the baseline of the slider before
+        imgui.set_cursor_pos((left + i * (wide + gap), top))
         with imgui_ctx.begin_group():
             small(name.capitalize(), PALETTE.dim, wide)
             wheel = _wheel(name, wheel, wide, ui)

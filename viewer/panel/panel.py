@@ -85,6 +85,7 @@ def draw(
     # the cleared framebuffer is its background: software GL takes a millisecond to fill it again
     imgui.get_background_draw_list().push_clip_rect((0.0, 0.0), (display.x - wide, display.y))
     flags = imgui.WindowFlags_.no_scroll_with_mouse.value | imgui.WindowFlags_.no_background.value
+    imgui.set_next_window_scroll((0.0, 0.0))  # keyboard focus would scroll title and footer, too
     imgui.begin("panel", None, FIXED | BEHIND | flags | ui.nav_flags("panel"))
     ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
