@@ -46,6 +46,8 @@ _GHOST_ALPHA = 0.9  # opacity of a decal that is not trained yet
 _OFF_SURFACE_ALPHA = 0.35  # opacity where there is no surface
 _GRIP_PX = 5.0  # half the side of a handle, at 1×
 _REACH_PX = 10.0  # at 1×: the mouse takes a handle within this distance
+SURFACE_POLL_S = 0.05
+"""Seconds between frames while the surface under a decal or paint is computed."""
 REST_S = 0.25
 """Seconds that the pointer must rest until the training's surface is computed before the click."""
 _KNOB_PX = 26.0  # distance of the knob that rotates from the upper side, at 1×
@@ -99,6 +101,22 @@ class DecalTextures:
             used.add(transient.gizmo.texture)
         for name in self._textures.keys() - used:
             self._textures.pop(name).release()
+
+
+def frame_delays(decal: object, is_busy: bool, now: float) -> list[float]:
+    """Return the seconds until the decal being placed needs a frame; empty for none.
+
+    Args:
+        decal: the object being placed; others than a `Decal` need none
+        is_busy: the surface under the decal is being computed
+        now: the clock of the window, seconds
+    """
+    if not isinstance(decal, Decal):
+        return []
+    if is_busy:
+        return [SURFACE_POLL_S]
+    rests = decal.frame is not None and not decal.surface
+    return [max(decal.laid_at + REST_S - now, 0.0)] if rests else []
 
 
 def draw_decal(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import zip_longest
+from collections.abc import Sequence
+from dataclasses import replace
 
 from imgui_bundle import imgui, imgui_ctx
 
@@ -17,10 +15,10 @@ from viewer.state import history, tour, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem, Plain
 from viewer.state.transient import Pull
-from viewer.state.workspace import Workspace
-from viewer.ui import overlay, tour_card
-from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import COMMANDS, JOINED, TOPICS, Command, chords, is_changed, shortcut
+from viewer.state.workspace import SceneFacts, Workspace
+from viewer.ui import key_list, overlay, tour_card
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.keys import COMMANDS, Command, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.search import find_commands
 from viewer.ui.widgets import elide, group_digits, menu, search_field
@@ -29,102 +27,22 @@ from . import color_tool, measure, mouse, select_tool
 from .inspect.readouts import Distributions
 from .pull.marks import draw_marks
 
-MOUSE_HELP = (
-    ("Left drag", "Orbit"),
-    ("Alt+left drag", "Orbit, with a tool too"),
-    ("Middle drag", "Orbit; Shift pans"),
-    ("Ctrl+middle drag", "Dolly"),
-    ("Right drag", "Pan; look around in fly"),
-    ("Wheel", "Zoom"),
-    ("Click", "Layer under the mouse"),
-    ("Double-click", "Orbit pivot"),
-    ("Axes", "Look from an end"),
-    ("W A S D Q E", "Fly; Shift fast, Alt slow"),
-    ("Slider", "Drag; Shift fine"),
-    ("Ctrl+click it", "Type a value"),
-    ("Double-click it", "Reset"),
-    ("Right-click", "Menu; cancels a drag"),
-)
 
-_MAC = (("Cmd", "Is Ctrl here; both work"),)
-
-# in sizes of the small text: row pitch, and space above a heading
-_ROW = 1.24
-_BETWEEN = 0.7
-# at 1×
-COLUMN_PX = 248.0
-_MARGIN_PX = 14.0
-MAX_COLUMNS = 4
-
-
-@dataclass(frozen=True)
-class Topic:
-    """Heading with rows of keys and their effects."""
-
-    name: str
-    rows: tuple[tuple[str, str], ...]
-
-    @property
-    def height(self) -> float:
-        """Height with the heading, in rows."""
-        return len(self.rows) + 1 + _BETWEEN / _ROW
-
-
-def topics() -> tuple[Topic, ...]:
-    """Return all commands by topic, each once."""
-    mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
-    return mouse, *(Topic(name, tuple(dict.fromkeys(_lines(commands)))) for name, commands in TOPICS.items())
-
-
-def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
-    """Yield the keys and text of each row. A key with Shift next to the same plain key is only named in the
-    text."""
-    is_joined = False  # the row before this one includes the command
-    for command, following in zip_longest(commands, commands[1:]):
-        keys = chords(command.id)
-        joins = following is not None and following.row == JOINED
-        changed = is_changed(command) or (joins and is_changed(following))
-        if joins and not changed:
-            keys += tuple(k for k in chords(following.id) if k.replace("Shift+", "") not in keys)
-        if keys and not is_joined:
-            plain = changed or command.row == JOINED
-            listed, text = ("", "") if plain else (command.listed, command.row)
-            yield listed or ", ".join(keys), text or command.name
-        is_joined = joins and not changed
-
-
-def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
-    """Distribute the topics, in order, over at most `count` columns with the lowest possible height."""
-    spans = ((i, j) for i in range(len(topics)) for j in range(i + 1, len(topics) + 1))
-    heights = {sum(topic.height for topic in topics[i:j]) for i, j in spans}
-    return next(packed for height in sorted(heights) if len(packed := _pack(topics, height)) <= count)
-
-
-def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
-    """Draw the list of keys centered in `room`, which starts at the upper left. A list that is too long
-    scrolls."""
-    margin = _MARGIN_PX * ui.scale
-    wide = COLUMN_PX * ui.scale
-    packed = columns(topics(), max(1, min(MAX_COLUMNS, int((room.x - 2 * margin) / wide))))
-    tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
-    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + 2 * margin, room.y))
-    imgui.set_next_window_pos(((room.x - size.x) / 2, (room.y - size.y) / 2))
-    imgui.set_next_window_size(size)
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim[:3], 0.97))
-    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, (margin, margin))
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, (8.0 * ui.scale, 0.0))
-    imgui.begin(
-        "keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_nav.value
-    )
-    imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
-    left = imgui.get_cursor_pos_x()
-    top = imgui.get_cursor_pos_y()
-    for i, column in enumerate(packed):
-        _column(column, left + i * wide, top, ui)
-    imgui.end()
-    imgui.pop_style_var(3)
-    imgui.pop_style_color()
+def texts_of(work: Workspace, facts: SceneFacts) -> str:
+    """Return the names and texts of the window that the user chose, joined."""
+    view = work.view
+    transient = work.transient
+    texts = [facts.title, work.session, work.search, work.query, work.form.name, work.form.sentence]
+    texts += [layer.name for layer in (*view.layers, *transient.live)]
+    texts += [group.name for group in view.groups]
+    texts += [region.name for region in view.selection.regions]
+    texts += [snapshot.name for snapshot in work.snapshots]
+    texts += [job.name for job in work.jobs]
+    texts += [file.name for file in transient.recent]
+    texts += [f"{file.path.name}{file.title}" for file in transient.start_files]
+    texts += [work.message.text] if work.message is not None else []
+    texts += [work.dialog.text] if work.dialog is not None else []
+    return "".join(texts)
 
 
 def draw_lists(
@@ -219,43 +137,6 @@ def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
     with imgui_ctx.push_font(None, SMALL_PX):
         canvas.add_text((round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
     return bool(pressed)
-
-
-def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> None:
-    step = SMALL_PX * ui.scale
-    with imgui_ctx.push_font(None, SMALL_PX):
-        wide = (
-            max(imgui.calc_text_size(chord).x for topic in topics for chord, _ in topic.rows)
-            + 14.0 * ui.scale
-        )
-        y = top - _BETWEEN * step
-        for topic in topics:
-            y += _BETWEEN * step
-            imgui.set_cursor_pos((left, y))
-            _heading(topic.name, ui)
-            for chord, does in topic.rows:
-                y += _ROW * step
-                imgui.set_cursor_pos((left, y))
-                imgui.text(chord)
-                imgui.set_cursor_pos((left + wide, y))
-                imgui.text_disabled(does)
-            y += _ROW * step
-
-
-def _heading(name: str, ui: UiContext) -> None:
-    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
-        imgui.text(name)
-
-
-def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:
-    """Fill columns of at most this height one after the other; a longer topic gets its own column."""
-    packed: list[list[Topic]] = []
-    for topic in topics:
-        if packed and sum(t.height for t in (*packed[-1], topic)) <= height:
-            packed[-1].append(topic)
-        else:
-            packed.append([topic])
-    return packed
 
 
 def panels(
@@ -406,7 +287,8 @@ def over_picture(
         work, requested = tour_card.draw(tour.follow(work, imgui.is_any_mouse_down()), area.width, bottom, ui)
         work = perform_actions(work, [requested] if requested is not None else [], pointer)
     if work.help:
-        draw_keys(free, ui)
+        query, requested = key_list.draw(work.help_query, free, ui)
+        work = perform_actions(replace(work, help_query=query), requested, pointer)
     return work
 
 

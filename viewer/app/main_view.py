@@ -33,7 +33,7 @@ from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.transient import Decal, Gizmo, KeyPointer, MouseTool, PreviewState, Pull
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import PLACES, SceneFacts, Store, Workspace, with_transient
-from viewer.ui import overlay
+from viewer.ui import fonts, overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
     COMMANDS,
@@ -51,7 +51,15 @@ from viewer.ui.pointer import PointerContext
 
 from . import color_tool, handles, interface, mouse, select_tool
 from .canvas import Canvas, FramePacer, LayersOf, RememberView, forget_view, no_layers
-from .decal import REST_S, DecalPlace, decal_takes_mouse, draw_decal, draw_ghosts, place_decal
+from .decal import (
+    SURFACE_POLL_S,
+    DecalPlace,
+    decal_takes_mouse,
+    draw_decal,
+    draw_ghosts,
+    frame_delays,
+    place_decal,
+)
 from .inspect import frusta
 from .inspect.readouts import Distributions, Inspection
 from .messages import Messages
@@ -59,7 +67,6 @@ from .pull import tool as pull_tool
 
 FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
 FLIGHT_S = 1 / 60  # seconds between frames while flying
-SURFACE_POLL_S = 0.05  # seconds between frames while the surface under a decal or paint is computed
 
 
 class MainView:
@@ -185,23 +192,13 @@ class MainView:
             waits.append(0.0)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
-        waits += self._decal_waits()
+        waits += frame_delays(self.work.transient.gizmo, self.decal_surfaces.is_busy, self._clock)
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
         waits += [SURFACE_POLL_S] if self.paint.pending else []
         waits += [FIT_POLL_S] if self.paint.fits.is_busy else []
         film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
-
-    def _decal_waits(self) -> list[float]:
-        """Return the seconds until the decal being placed needs a frame; empty for none."""
-        decal = self.work.transient.gizmo
-        if not isinstance(decal, Decal):
-            return []
-        if self.decal_surfaces.is_busy:
-            return [SURFACE_POLL_S]
-        rests = decal.frame is not None and not decal.surface
-        return [max(decal.laid_at + REST_S - self._clock, 0.0)] if rests else []
 
     def is_due(self) -> bool:
         """Return True if a frame would show anything new.
@@ -227,6 +224,9 @@ class MainView:
         self._resting = False
         with self._guard():
             self.store.replace(workspace.advance(self.work, seconds))
+        with self._guard():
+            if missing := self.ui.fallbacks.cover(interface.texts_of(self.work, self.facts)):
+                self.messages.show(fonts.missing_message(missing))
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
         with self._guard():

@@ -29,6 +29,7 @@ from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     accent_button,
     elide,
+    empty_line,
     entry,
     grip,
     hint,
@@ -233,9 +234,11 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Works
     side = imgui.get_frame_height()
     text = "+ New edit"
     wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
+    if _is_empty(work):
+        return work  # the line of the empty list has the button
     menu_button = side + 4.0 * ui.scale if work.view.layers else 0.0
     imgui.same_line(right - wide - menu_button)
-    if (imgui.button if work.view.layers else accent_button)(text, (wide, 0.0)):
+    if imgui.button(text, (wide, 0.0)):
         actions.append(Plain("new_edit"))
     hint("new_edit")
     if not work.view.layers:
@@ -246,6 +249,11 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[Action]) -> Works
     tip("Blend rule, overshoot, compact rows")
     with menu("about layers", ui) as is_open:
         return replace(work, view=_choose_rules(work, ui, actions)) if is_open else work
+
+
+def _is_empty(work: Workspace) -> bool:
+    """Return True if there is no layer, no job that makes one, and no open form."""
+    return not (work.view.layers or work.jobs or work.form_open)
 
 
 def _choose_rules(work: Workspace, ui: UiContext, actions: list[Action]) -> ViewState:
@@ -278,11 +286,8 @@ def draw(
         thumbnails: GL names of the thumbnails of the edits in the same order, 0 before one is drawn
         reveal: scroll to the focused layer, and to partly visible selected ones
     """
-    if not (work.view.layers or work.jobs or work.form_open):
-        with imgui_ctx.push_text_wrap_pos(0.0):
-            imgui.text_disabled(
-                f"No edits yet. Make one ({shortcut('new_edit')}), or drop a .gdf file on the window."
-            )
+    if _is_empty(work):
+        empty_line("No edits yet", ("new_edit", "open"), ui, actions)
     work = replace(
         work,
         pointed=None,
@@ -337,7 +342,10 @@ def draw(
         if touch.press and (work.selected or touch.press in ("toggle", "range")):
             actions.append(PressLayer(touch.press, i, tuple(listed)))
     if work.view.layers and not listed:
-        small("No matching layer", PALETTE.dim)
+        empty_line("No matching layer", (), ui, actions)
+        imgui.same_line(0.0, 8.0 * ui.scale)
+        if accent_button("Show all", (0.0, 0.0)):
+            work = replace(work, search="")
     if work.renaming is not None and not any(l.layers == (work.renaming,) and not l.heads for l in lines):
         work = replace(work, renaming=None)
     if gesture:

@@ -6,6 +6,7 @@ until the file is saved; then the file actions close it.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -16,11 +17,12 @@ from imgui_bundle import imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
+from viewer.files.completion import complete, completions
 from viewer.state.commands import Action, OnItem, Plain, RebindEdit, ReplaceEdit, Save, WithText
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import accent_button, inert, small, tip, wrapped_text
+from viewer.ui.widgets import accent_button, elide, inert, small, tip, wrapped_text
 
 from . import pages
 
@@ -78,6 +80,9 @@ _SUBMIT = {
     "render_film": "Render",
 }
 """Button of each dialog that has a path field."""
+_OPENS = ("open", "replace", "rebind")
+_STAYS_OPEN = imgui.SelectableFlags_.no_auto_close_popups.value
+_PATH_ROWS = 6  # visible rows of the list of files
 _DELIVERS = ("export", "export_page", "render_picture", "render_film")
 
 
@@ -170,8 +175,10 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     gap = 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
+    if dialog.kind in _OPENS:
+        flags |= imgui.InputTextFlags_.callback_completion.value
     escaped = escape_text(dialog.text)
-    _, text = imgui.input_text("##path", escaped, flags)
+    _, text = imgui.input_text("##path", escaped, flags, _complete)
     text = dialog.text if text == escaped else text  # a name that is not UTF-8 stays unchanged
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
@@ -180,6 +187,8 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
         return DialogResult(dialog, (Plain("browse"),))
+    if dialog.kind in _OPENS:
+        dialog = replace(dialog, text=_path_list(text, ui) or text)
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
@@ -199,6 +208,40 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     return DialogResult(dialog)
 
 
+def _complete(data: imgui.InputTextCallbackData) -> int:
+    """Complete the path in the text field; imgui calls it when Tab is pressed."""
+    completed = complete(data.buf)
+    if completed != data.buf:
+        data.delete_chars(0, data.buf_text_len)
+        data.insert_chars(0, completed)
+    return 0
+
+
+def _path_list(typed: str, ui: UiContext) -> str:
+    """Draw the files and folders that complete a path; return the pressed one, "" for none.
+
+    The height is constant, so that the buttons below do not move.
+    """
+    pressed = ""
+    row = imgui.get_text_line_height_with_spacing()
+    imgui.begin_child("paths", (0.0, _PATH_ROWS * row))
+    found = completions(typed)
+    if not found:
+        small("No matching file" if typed.strip() else "Type a path; Tab completes it", PALETTE.dim)
+    clipper = imgui.ListClipper()
+    clipper.begin(len(found), row)
+    while clipper.step():
+        for path in found[clipper.display_start : clipper.display_end]:
+            name = os.path.basename(path.rstrip(os.sep)) + (os.sep if path.endswith(os.sep) else "")
+            line = elide(escape_text(name), imgui.get_content_region_avail().x)
+            if imgui.selectable(f"{line}##{path}", False, imgui.SelectableFlags_.no_auto_close_popups.value)[
+                0
+            ]:
+                pressed = path
+    imgui.end_child()
+    return pressed
+
+
 def _is_new(kind: str) -> bool:
     """Return True if this dialog was not open in the last frame; another may have used the same popup."""
     storage = imgui.get_state_storage()
@@ -212,7 +255,8 @@ def _is_new(kind: str) -> bool:
 def _submit(dialog: Dialog, path: str) -> DialogResult:
     """Request the file; the dialog stays open if the file may be rejected."""
     kept = dialog.kind in ("save", "open", *_DELIVERS)
-    stays = replace(dialog, text=path, chosen="", error="") if kept else None
+    error = dialog.error if dialog.kind in _DELIVERS else ""  # a second press confirms an existing file
+    stays = replace(dialog, text=path, chosen="", error=error) if kept else None
     return DialogResult(stays, (_submission(dialog, path),))
 
 
@@ -365,7 +409,7 @@ class Browser:
             return replace(dialog, notice=missing)
         self.close()
         path = Path(dialog.text or near).expanduser().absolute()
-        if dialog.kind in ("open", "replace", "rebind"):
+        if dialog.kind in _OPENS:
             folder = path if path.is_dir() else path.parent
             self._dialog = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
         else:

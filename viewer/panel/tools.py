@@ -257,12 +257,14 @@ def _selection(view: ViewState, bar: _Bar, actions: list[Action]) -> Pointed | N
         imgui.text_disabled(text)
         if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
             pointed = ("selection", 0)
-        with inert(not count):
+        if count:
             bar.button("select_refine", actions)
             bar.follow(imgui.get_frame_height())
             more_button("more", _OPERATIONS, bar.ui, actions)
             tip("Grow, shrink, smooth, invert, paint on the object, hide, remove, move, copy")
             _save(len(view.selection.regions), bar, actions)
+        else:
+            bar.button("select_subject", actions)
     if view.selection.hidden:
         bar.button("show_hidden", actions, f"{Icon.HIDDEN}  ")
     return pointed

@@ -14,6 +14,7 @@ from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, w
 
 BAR_PX = 5.0  # height of a progress bar, at 1×
 STRIP_PX = 28.0  # height of the strip, at 1×
+_BUTTON_PAD_PX = 2.0  # above and below the text of a button, at 1×
 _MENU = "menu of a training"
 _DISCARD = "Discard…"
 _NOTHING_WRITTEN = "No file will be written"
@@ -57,6 +58,8 @@ def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
             if unseen and job.number == failed:
                 imgui.set_scroll_here_y(1.0)
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
+        if imgui.is_window_hovered(imgui.HoveredFlags_.child_windows.value):
+            needed = max(needed, old_height)  # the other buttons stay under the pointer as a card closes
         imgui.end_child()
         storage.set_float(tall, min(needed, room))
         if old_height == min(needed, room):  # the cards have their final heights
@@ -191,14 +194,18 @@ def _foot(job: JobCard, right: float, menu: bool, ui: UiContext) -> list[str]:
     actions = []
     x = right - sum(widths)
     imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
+    pad = _BUTTON_PAD_PX * ui.scale
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, (imgui.get_style().frame_padding.x, pad))
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - pad)  # its text is in line with the step
         with imgui_ctx.push_font(None, SMALL_PX):
-            if imgui.small_button(f"{text}##{action}"):
+            if imgui.button(f"{text}##{action}"):
                 actions.append(action)
         if help_:
             tip(help_)
         x += wide
+    imgui.pop_style_var()
     imgui.pop_style_color()
     return actions
 

@@ -47,8 +47,8 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
     top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
     if top < foot and area.width < NARROW_PX * ui.scale:
         return view  # the options bar covers it
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
     with plate("view", (area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), PAD_PX):
+        imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
         icon_row(_VIEW_BUTTONS, ui, actions)
         imgui.same_line()
         if icon_button("view", Icon.VIEW, ui, lit=view.mode != ViewState.mode):

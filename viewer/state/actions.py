@@ -569,7 +569,7 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "next_view_mode": lambda w, _: _next_value(w, "mode", VIEW_MODES),
     "safe_frame": lambda w, _: _next_value(w, "safe_frame", FRAMES),
     "tour": lambda workspace, _: tour.start(workspace),
-    "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "help": lambda workspace, _: replace(workspace, help=not workspace.help, help_query=""),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),

@@ -178,6 +178,7 @@ class Workspace:
     active_slider: str = "strength"  # slider that the arrow keys move, one of `layers.SLIDERS`
     renaming: int | None = None  # index of the layer being renamed
     help: bool = False  # whether the key list is open
+    help_query: str = ""  # search text of the key list
     keyboard: str = ""  # part of the window with keyboard focus, one of `PLACES`, "" for the picture
     keyboard_by: int = 1  # direction of the last focus change, 1 or −1
     palette: int | None = None  # active line of the command palette, −1 when it opens

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
-from .splash import ACCENT, FIELD, FONTS, PANEL, REGULAR, TEXT, TEXT_PX
+from .fonts import FallbackFonts, load_fonts
+from .splash import ACCENT, FIELD, PANEL, TEXT, TEXT_PX
 
 Rgba = tuple[float, float, float, float]
 
 FONT_PX = TEXT_PX  # at 1×
-SMALL_PX = 13.0
+SMALL_PX = 12.0
 
 
 def _rgb(code: int, alpha: float = 1.0) -> Rgba:
@@ -114,14 +115,6 @@ class Icon:
     SPLIT = icons.ICON_FA_CIRCLE_HALF_STROKE
 
 
-@dataclass(frozen=True)
-class Fonts:
-    """Regular font with icons, and bold font."""
-
-    regular: imgui.ImFont
-    bold: imgui.ImFont
-
-
 class UiContext:
     """imgui context with its fonts and scale. Make it current before drawing; `close` it when done.
 
@@ -142,7 +135,8 @@ class UiContext:
         self.focused = ""  # part that received the keyboard last
         self.is_sliding = False  # a strength slider of the panel is dragged
         self.known_tips: dict[str, int] = {}  # tooltips shown once per session, and their last frame
-        self.fonts = _load_fonts(io.fonts)
+        self.fonts = load_fonts(io.fonts)
+        self.fallbacks = FallbackFonts(io.fonts, self.fonts)
         self.scale = 0.0
         self.set_scale(scale)
 
@@ -197,16 +191,6 @@ def _silence_imgui(silent: bool) -> None:
     io.config_error_recovery_enable_assert = not silent
     io.config_error_recovery_enable_debug_log = not silent
     io.config_error_recovery_enable_tooltip = not silent
-
-
-def _load_fonts(atlas: imgui.ImFontAtlas) -> Fonts:
-    regular = atlas.add_font_from_file_ttf(str(REGULAR), FONT_PX)
-    merged = imgui.ImFontConfig()
-    merged.merge_mode = True
-    merged.glyph_min_advance_x = FONT_PX
-    atlas.add_font_from_file_ttf(str(FONTS / "Font_Awesome_6_Free-Solid-900.otf"), FONT_PX - 2, merged)
-    bold = atlas.add_font_from_file_ttf(str(FONTS / "Roboto" / "Roboto-Bold.ttf"), FONT_PX)
-    return Fonts(regular, bold)
 
 
 def _apply_style(scale: float) -> None:

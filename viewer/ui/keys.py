@@ -121,7 +121,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
             "Next view mode",
             "Z",
             "Splats, centers, rings, depth and more",
-            row="Next view mode; Shift splats",
+            row="View mode; Shift splats",
         ),
         Command("view_mode:splats", "Show splats", "Shift+Z", "The scene as it is", row=JOINED),
         Command("view_mode:centers", "Show centers", "", "A dot per splat"),
@@ -159,6 +159,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
             "Ctrl+Shift+C",
             "Of the form or the layer",
             row="Copy, paste settings",
+            listed="Ctrl+Shift+C, V",
         ),
         Command("paste_edit", "Paste settings", "Ctrl+Shift+V", "Opens the form, in any scene", row=JOINED),
         Command("remove", "Delete", "Ctrl+Delete"),
@@ -185,6 +186,12 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("paste_keys", "Paste keyframes", "Ctrl+V", "At the playhead", row=JOINED),
         Command("history", "History…", "Ctrl+Alt+Z", "All changes; click one to return to it"),
     ),
+    "Color": (
+        Command("paint_tool:color", "Color brush", "Alt+B", "Paint on the surface; Alt+click picks a color"),
+        Command("paint_tool:clone", "Clone stamp", "Alt+C", "Alt+click sets the source to copy from"),
+        Command("finish_paint", "Done painting", "Alt+Enter", "Turn the paint into a layer with a slider"),
+        Command("discard_paint", "Discard paint", "", "Remove all paint that is not a layer yet"),
+    ),
     "Brush": (
         Command("brush", "Paint strength", "B", "Left-drag over the selected layer"),
         Command("brush_mode", "Erase, smooth, add", "X"),
@@ -202,12 +209,6 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("paint_fill", "Fill with paint", "Shift+Backspace", "Weights to 1", row=JOINED),
         Command("paint_invert", "Invert the paint", "", "Swap painted and unpainted parts"),
         Command("paint_feather", "Feather the paint", "Shift+X", "Soften its edges; repeat for more"),
-    ),
-    "Color": (
-        Command("paint_tool:color", "Color brush", "Alt+B", "Paint on the surface; Alt+click picks a color"),
-        Command("paint_tool:clone", "Clone stamp", "Alt+C", "Alt+click sets the source to copy from"),
-        Command("finish_paint", "Done painting", "Alt+Enter", "Turn the paint into a layer with a slider"),
-        Command("discard_paint", "Discard paint", "", "Remove all paint that is not a layer yet"),
     ),
     "Select": (
         Command("select_tool:box", "Box", "R", MODES),

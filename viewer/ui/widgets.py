@@ -125,9 +125,9 @@ def plate(
     imgui.set_next_window_size(size or (0.0, 0.0))
     imgui.push_style_color(imgui.Col_.window_bg, PALETTE.scrim)
     alpha = imgui.get_style().alpha * (MOVING_OPACITY if ui.is_sliding else 1.0)
+    imgui.push_style_var(imgui.StyleVar_.alpha, alpha)
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 4.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, (pad * ui.scale, pad * ui.scale))
-    imgui.push_style_var(imgui.StyleVar_.alpha, alpha)
     fits = imgui.WindowFlags_.always_auto_resize.value if size is None else 0
     imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits | ui.nav_flags(name))
     imgui.pop_style_var(2)
@@ -208,6 +208,18 @@ def icon_button(
 def hint(command: str, more: str = "") -> None:
     """Show the tooltip of the last item's command, followed by `more`."""
     tip(describe(command, more))
+
+
+def empty_line(text: str, commands: Sequence[str], ui: UiContext, actions: list[Action]) -> None:
+    """Draw the line of an empty list: its state, and a button for each command that fills it."""
+    imgui.align_text_to_frame_padding()
+    imgui.text_disabled(text)
+    for i, command in enumerate(commands):
+        imgui.same_line(0.0, 8.0 * ui.scale)
+        name = COMMANDS[command].name.removesuffix("…")
+        if imgui.button(name) if i else accent_button(name, (0.0, 0.0)):
+            actions.append(COMMANDS[command].action)
+        hint(command)
 
 
 def icon_row(

@@ -18,7 +18,6 @@ from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
-from viewer.app import interface
 from viewer.camera.view_camera import first_camera
 from viewer.files import exports
 from viewer.files.document import empty
@@ -26,6 +25,7 @@ from viewer.panel.tools import paint_obstacle
 from viewer.state import actions, selection, timeline
 from viewer.state.commands import Plain
 from viewer.state.view_state import ViewState
+from viewer.ui import key_list
 from viewer.ui.context import SMALL_PX
 from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, shortcut
 from viewer.ui.search import WORDS, find_commands
@@ -34,7 +34,7 @@ SMALLEST = (1024, 640)
 
 
 def test_every_command_has_a_name_and_keys_have_a_row() -> None:
-    listed = [row for topic in interface.topics()[1:] for row in topic.rows]
+    listed = [row for topic in key_list.topics()[1:] for row in topic.rows]
     assert len(listed) == len(set(listed))
     for command in COMMANDS.values():
         text = command.row or command.name
@@ -42,7 +42,7 @@ def test_every_command_has_a_name_and_keys_have_a_row() -> None:
         assert (text in [does for _, does in listed]) == (bool(command.keys) and text != JOINED), command
         assert not command.listed or keys == {command.listed}
     assert {("Ctrl+G", "Group; Shift ungroups"), ("Ctrl+C, Ctrl+V", "Copy, paste keys")} <= {*listed}
-    assert all(topic.rows for topic in interface.topics())
+    assert all(topic.rows for topic in key_list.topics())
     assert all(command.name for command in COMMANDS.values())
 
 
@@ -180,10 +180,28 @@ def test_key_list_opens_and_closes_by_f1_and_escape() -> None:
             assert not hand.main_view.work.help
 
 
+@pytest.mark.gl
+def test_key_list_is_searched_and_closed_by_its_button() -> None:
+    with rig(None, (1024, 640)) as hand:
+        hand.key("F1")
+        assert not hand.io.want_text_input, "keys stay active"
+        window = shown(hand)
+        corner = window.pos.x + window.size.x - 27.0, window.pos.y + 27.0
+        hand.click(corner[0] - 100.0, corner[1])
+        type_text(hand, "shrink")
+        assert hand.main_view.work.help_query == "shrink"
+        assert [topic.name for topic in key_list.find_rows("shrink")] == ["Select"]
+        assert key_list.find_rows("brush ctrl") == ()
+        hand.click(*corner)
+        assert not hand.main_view.work.help
+        hand.key("F1")
+        assert not hand.main_view.work.help_query
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
 def test_columns_keep_all_topics_in_order_and_are_balanced(count: int) -> None:
-    topics = interface.topics()
-    found = interface.columns(topics, count)
+    topics = key_list.topics()
+    found = key_list.columns(topics, count)
     assert len(found) <= count
     assert tuple(topic for column in found for topic in column) == topics
     longest = max(sum(topic.height for topic in column) for column in found)
@@ -208,7 +226,7 @@ def test_bound_keys_replace_defaults_and_are_taken_from_others() -> None:
     assert (found["timeline"], found["brush"]) == ([], []), "T and B do something else now"
     assert found["undo"] == ["Ctrl+Z"]
     assert (shortcut("snapshot"), shortcut("quit")) == ("F6", "")
-    rows = {does: keys for topic in interface.topics() for keys, does in topic.rows}
+    rows = {does: keys for topic in key_list.topics() for keys, does in topic.rows}
     assert (rows["Add snapshot"], rows["Compare snapshots"]) == ("F6", "Shift+F5"), "each in a row of its own"
     assert "Quit" not in rows
     assert bind({}) == []
@@ -282,7 +300,14 @@ def test_keys_file_is_created_complete_and_read_on_start(
 
 
 def shown(hand: Rig) -> imgui.internal.Window:
+    """Return the window of the key list."""
     return imgui.internal.find_window_by_name("keys")
+
+
+def rows_of(hand: Rig) -> imgui.internal.Window:
+    """Return the scrolling part of the key list."""
+    windows = imgui.get_current_context().windows
+    return next(window for window in windows if window.name.startswith("keys/rows"))
 
 
 @pytest.mark.gl
@@ -296,8 +321,8 @@ def test_whole_key_list_is_readable_in_the_smallest_window(
         hand.key("F1")
         hand.frame(2)
         topics_window = shown(hand)
-        assert topics_window.scroll_max.y == 0.0
-        assert topics_window.scroll_max.x == 0.0
+        assert rows_of(hand).scroll_max.y == 0.0
+        assert rows_of(hand).scroll_max.x == 0.0
         assert topics_window.pos.y >= 0.0
         assert topics_window.pos.y + topics_window.size.y <= points[1]
         assert fits_its_columns(hand)
@@ -307,13 +332,13 @@ def fits_its_columns(hand: Rig) -> bool:
     """Return True if every line fits its column."""
     imgui.new_frame()
     imgui.push_font(hand.main_view.ui.fonts.regular, SMALL_PX)
-    room = (interface.COLUMN_PX - 8.0) * hand.main_view.ui.scale
+    room = (key_list.COLUMN_PX - 8.0) * hand.main_view.ui.scale
     fits = all(
         max(imgui.calc_text_size(chord).x for topic in column for chord, _ in topic.rows)
         + 14.0 * hand.main_view.ui.scale
         + max(imgui.calc_text_size(does).x for topic in column for _, does in topic.rows)
         <= room
-        for column in interface.columns(interface.topics(), interface.MAX_COLUMNS)
+        for column in key_list.columns(key_list.topics(), key_list.MAX_COLUMNS)
     )
     imgui.pop_font()
     imgui.end_frame()
@@ -330,7 +355,7 @@ def test_message_of_several_lines_stays_below_the_key_list(times: int) -> None:
         topics_window = shown(hand)
         message = imgui.internal.find_window_by_name("message")
         assert topics_window.pos.y + topics_window.size.y <= message.pos.y
-        assert times > 4 or topics_window.scroll_max.y == 0.0
+        assert times > 4 or rows_of(hand).scroll_max.y == 0.0
 
 
 @pytest.mark.gl
@@ -339,10 +364,10 @@ def test_key_list_scrolls_to_its_end_in_a_too_small_window() -> None:
         hand.key("F1")
         hand.frame(2)
         before = hand.main_view.work.view.camera
-        assert shown(hand).scroll_max.y > 0.0
+        assert rows_of(hand).scroll_max.y > 0.0
         for _ in range(40):
             hand.wheel(320.0, 200.0, -2.0)
-        assert shown(hand).scroll.y == shown(hand).scroll_max.y
+        assert rows_of(hand).scroll.y == rows_of(hand).scroll_max.y
         assert hand.main_view.work.view.camera == before, "the wheel over it zooms nothing"
 
 
@@ -352,12 +377,12 @@ def test_command_key_acts_as_ctrl_on_a_mac(
     from viewer.ui import window
 
     assert window.chord("S", window.glfw.MOD_SUPER) == "S"
-    assert not any("Cmd" in row for topic in interface.topics() for row in topic.rows)
+    assert not any("Cmd" in row for topic in key_list.topics() for row in topic.rows)
     monkeypatch.setattr(sys, "platform", "darwin")
     both = window.glfw.MOD_SUPER | window.glfw.MOD_SHIFT
     assert window.chord("S", both) == window.chord("S", window.glfw.MOD_CONTROL | window.glfw.MOD_SHIFT)
     assert window.chord("S", both) == "Ctrl+Shift+S"
-    assert any("Cmd" in row for topic in interface.topics() for row in topic.rows)
+    assert any("Cmd" in row for topic in key_list.topics() for row in topic.rows)
 
 
 def test_window_requests_the_gl_context_that_macs_support() -> None:

@@ -166,9 +166,7 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
         )
 
     hand.main_view.store.replace(
-        replace(
-            hand.main_view.work, jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "running"),)
-        )
+        replace(hand.main_view.work, jobs=(JobCard(1, "Film film.mp4", Path("/scenes/film.mp4"), "running"),))
     )
     assert cards() == 0
     hand.click(*strip)
@@ -178,7 +176,7 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
     hand.main_view.store.replace(
         replace(
             hand.main_view.work,
-            jobs=(JobCard(1, "Rendering film.mp4", Path("/scenes/film.mp4"), "failed", error="no room"),),
+            jobs=(JobCard(1, "Film film.mp4", Path("/scenes/film.mp4"), "failed", error="no room"),),
         )
     )
     assert cards() == 1

@@ -597,7 +597,7 @@ def test_quitting_asks_while_a_file_is_written(window: application.App, tmp_path
     press(window, "Escape", "Ctrl+Q")
     dialog = window.main_view.work.dialog
     assert dialog is not None
-    assert (dialog.kind, dialog.text) == ("delivery", "Exporting bear_edited-2.ply")
+    assert (dialog.kind, dialog.text) == ("delivery", "Scene bear_edited-2.ply")
     press(window, "Enter")
     assert not window.is_closed
     press(window, "Ctrl+Q", "S")

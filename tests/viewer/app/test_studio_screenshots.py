@@ -84,7 +84,7 @@ def test_screenshot_of_run_cards_and_a_film(screenshot: Compare) -> None:
         QueuedTask(3, replace(order, name="night"), "stopped", Progress(0.6)),
         QueuedTask(4, replace(order, name="nowhere"), "failed", error=line),
     )
-    film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
+    film = Delivery("Film film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     frames = Progress(30 / 96, "frame 30 of 96")
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         hand.main_view.store.replace(
@@ -107,7 +107,7 @@ def test_screenshot_of_the_film_question(screenshot: Compare) -> None:
 
 
 def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> None:
-    film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
+    film = Delivery("Film film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     line = "no frame could be written: the disk takes no more, free some space"
     jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
     with rig(first_view(bear(), 0.7), MINIMUM_SIZE_PX) as hand:

@@ -263,7 +263,7 @@ def test_stopped_delivery_beside_a_training_leaves_no_files(stopped: EditOrder, 
     queue.resume(1)
     out = tmp_path / "film.mp4"
     log = tmp_path / "film.log"
-    queue.add(Delivery("Rendering film.mp4", out, ("render", f"--out={out}"), log, stopped.scene))
+    queue.add(Delivery("Film film.mp4", out, ("render", f"--out={out}"), log, stopped.scene))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "running"]
     log.write_text("frame 3/12\n")

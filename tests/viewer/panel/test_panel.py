@@ -270,7 +270,7 @@ def test_undo_button_is_disabled_without_history(hand: Hand) -> None:
 def test_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
     hand.click(LEFT - 24, 129)
-    hand.click(LEFT - 64, 169)
+    hand.click(LEFT - 76, 263)
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
     assert history.next_undo(hand.work.past) == "up axis"
     hand.ui.close()
@@ -280,7 +280,7 @@ def test_up_direction_of_the_view_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
     before = axes(hand.work.view.camera)
     hand.click(LEFT - 24, 129)
-    hand.click(LEFT - 34, 169)
+    hand.click(LEFT - 38, 263)
     after = axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):

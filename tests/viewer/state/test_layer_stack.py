@@ -482,7 +482,7 @@ def test_double_click_on_a_slider_resets_it_to_its_default(hand: Rig) -> None:
     hand.double_click(*hand.slider(1, 0.5))
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
-    lens = (LEFT - 60, 96.0)  # in the view popover
+    lens = (LEFT - 60, 189.0)  # in the view popover
     hand.pause(0.5)
     click(hand, LEFT - 24, 24.0)
     click(hand, *lens)

@@ -24,6 +24,8 @@ from viewer.state.workspace import Dialog, Store
 
 SUFFIXES = {"export": ".ply", "export_page": ".html", "render_picture": ".png", "render_film": ".mp4"}
 """Suffix of the output file, per dialog."""
+NOUNS = {"export": "Scene", "export_page": "Web page", "render_picture": "Picture", "render_film": "Film"}
+"""First word of a job's name, per dialog; it fits a running and a finished job."""
 
 
 class DeliverActions:
@@ -96,7 +98,7 @@ class DeliverActions:
         out = free_path(edit.parent, f"{edit.stem}-rebound", edit.suffix)
         words = ("rebind", str(edit), f"--from={parse_path(source)}", f"--to={scene}", f"--out={out}")
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
-        self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, scene))
+        self._queue.add(Delivery(f"Rebound {edit.name}", out, words, log, scene))
 
     def _start(self, kind: str, dialog: Dialog) -> None:
         out = parse_path(dialog.text).resolve()
@@ -129,7 +131,7 @@ class DeliverActions:
             "render_picture": ["render", f"--out={out}", size, *background],
             "render_film": ["render", f"--out={out}", size, "--timeline"],
         }[kind]
-        title = f"{'Exporting' if kind.startswith('export') else 'Rendering'} {out.name}"
+        title = f"{NOUNS[kind]} {out.name}"
         self._queue.add(
             Delivery(title, out, (*words, str(stack)), stack.with_suffix(".log"), document.file.resolve())
         )
