@@ -287,8 +287,8 @@ def over_picture(
         work, requested = tour_card.draw(tour.follow(work, imgui.is_any_mouse_down()), area.width, bottom, ui)
         work = perform_actions(work, [requested] if requested is not None else [], pointer)
     if work.help:
-        query, requested = key_list.draw(work.help_query, free, ui)
-        work = perform_actions(replace(work, help_query=query), requested, pointer)
+        query, pressed = key_list.draw(work.help_query, free, ui)
+        work = perform_actions(replace(work, help_query=query), pressed, pointer)
     return work
 
 

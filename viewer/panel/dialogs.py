@@ -17,7 +17,7 @@ from imgui_bundle import imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
-from viewer.files.completion import complete, completions
+from viewer.files.user_files import complete_path, path_completions
 from viewer.state.commands import Action, OnItem, Plain, RebindEdit, ReplaceEdit, Save, WithText
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, UiContext
@@ -210,8 +210,9 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
 
 def _complete(data: imgui.InputTextCallbackData) -> int:
     """Complete the path in the text field; imgui calls it when Tab is pressed."""
-    completed = complete(data.buf)
-    if completed != data.buf:
+    typed = str(data.buf)
+    completed = complete_path(typed)
+    if completed != typed:
         data.delete_chars(0, data.buf_text_len)
         data.insert_chars(0, completed)
     return 0
@@ -225,7 +226,7 @@ def _path_list(typed: str, ui: UiContext) -> str:
     pressed = ""
     row = imgui.get_text_line_height_with_spacing()
     imgui.begin_child("paths", (0.0, _PATH_ROWS * row))
-    found = completions(typed)
+    found = path_completions(typed)
     if not found:
         small("No matching file" if typed.strip() else "Type a path; Tab completes it", PALETTE.dim)
     clipper = imgui.ListClipper()

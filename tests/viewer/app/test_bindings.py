@@ -56,7 +56,7 @@ INTERNAL = {
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
     *("carry_on", "look_behind", "refine_anyway", "fill_hole", "true_length", "keep_pull", "leave_pull"),
-    *("stop_making", "test_editor", "allow_outside", "save_look"),
+    *("stop_making", "test_editor", "allow_outside", "save_look", "set_blend"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""
 
@@ -66,7 +66,7 @@ def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
     with null_app(empty(), ViewState(), tmp_path) as app:
         everything = {*app.requests, *exports.REQUESTS}
     everything |= {*actions.ACTIONS, *timeline.ACTIONS, *actions.OF_EDITS, *selection.CHANGES}
-    everything |= {"frame", "home", "invert"}
+    everything |= {"frame", "home", "invert", "flip_up"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "point", "point_press", "select_subject"}
     named = {command.action.name for command in COMMANDS.values()}
