@@ -290,9 +290,7 @@ def _menu(
     with menu(_MENU, ui) as is_open:
         off = []
         if is_open and with_settings(NewEdit(), row.instruction) is None:
-            off.append("again")
-        if not row.instruction:
-            off.append("copy_edit")
+            off += ["again", "copy_edit"]
         if not state.selection.count:
             off.append("limit_to_selection")
         for action in _MENU_ITEMS if is_open else ():

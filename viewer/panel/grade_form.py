@@ -288,7 +288,7 @@ def _wheel(name: str, wheel: Wheel, wide: float, ui: UiContext) -> Wheel:
     if is_double_clicked():
         wheel = Wheel(light=wheel.light)
         at = 0.0, 0.0
-    elif imgui.is_item_active() and imgui.is_mouse_down(0):
+    elif _is_dragged():
         mouse = imgui.get_io().mouse_pos
         moved = (mouse.x - center[0]) / radius, (center[1] - mouse.y) / radius
     elif imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible:
@@ -312,6 +312,13 @@ def _wheel(name: str, wheel: Wheel, wide: float, ui: UiContext) -> Wheel:
     canvas.add_line(center, point, u32(PALETTE.dim), ui.scale)
     canvas.add_circle_filled(point, 4.5 * ui.scale, u32(PALETTE.text))
     return wheel
+
+
+def _is_dragged() -> bool:
+    """Return whether the mouse holds the last item, or has moved and released it in this frame."""
+    if imgui.is_item_active():
+        return bool(imgui.is_mouse_down(0))
+    return bool(imgui.is_item_deactivated() and imgui.is_mouse_released(0))
 
 
 @cache
@@ -406,7 +413,8 @@ def _curve(
     wide = imgui.get_content_region_avail().x
     imgui.invisible_button("curve", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
     tip("Press to add and drag a point, double-click to delete it; or Space, arrows, Del")
-    keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible
+    dragged = _is_dragged()
+    keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible and not dragged
     storage = imgui.get_state_storage()
     held = imgui.get_id("curve/held")
     mouse = imgui.get_io().mouse_pos
@@ -436,7 +444,7 @@ def _curve(
             points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
             near = min(range(len(points)), key=lambda i: apart(points[i]))
         storage.set_int(held, near)
-    elif (keyed or imgui.is_item_active()) and 0 <= (i := chosen) < len(points):
+    elif (keyed or dragged) and 0 <= (i := chosen) < len(points):
         if keyed:
             by = key_step(key.left_arrow, key.right_arrow), key_step(key.down_arrow, key.up_arrow)
             at = points[i][0] + by[0], points[i][1] + by[1]

@@ -131,3 +131,18 @@ def test_wheel_follows_a_drag_and_a_double_click_resets_it(hand: Rig) -> None:
     for _ in range(2):
         hand.click(*center)
     assert form(hand).spec == "grade"
+
+
+def test_fast_drag_that_ends_within_a_frame_moves_the_point(hand: Rig) -> None:
+    x = LEFT + 40.0
+    y = CURVE_TOP + 40.0
+    imgui.set_nav_cursor_visible(True)  # as after opening the form by keys
+    hand.move(x, y)
+    hand.press()
+    ((_, before),) = parse_curve(form(hand).curves[0])
+    hand.io.add_mouse_pos_event(x, y - 20.0)
+    hand.io.add_mouse_button_event(0, False)
+    hand.event()
+    hand.settle()
+    ((_, after),) = parse_curve(form(hand).curves[0])
+    assert after == pytest.approx(before + 20.0 / grade_form.CURVE_PX, abs=0.02)
