@@ -3,6 +3,7 @@
 The ideal model knows twelve equally good edits of a bear, and the noise of each call decides between them. It
 is called as `command:`, `api:`, `comfy:` and `instruct:` call their models. The trainer turns the pictures
 into an edit. Held-out views compare its slider with the nearest of the twelve edits at the same degree.
+Figures are means over several seeds of that noise.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -48,6 +50,7 @@ GAUSSIANS = 2000
 VIEWS = 16
 SIZE = 56  # pixels
 CHOICES = 12
+SEEDS = (0, 10, 20)  # of the model's noise; a view that is painted again takes the next one
 
 DEGREES = (0.25, 0.5, 0.75)
 PROMPTS = {"a hint of it": 0.2, "half of it": 0.45, "most of it": 0.8}
@@ -130,7 +133,8 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         for family in FAMILIES:
             subject = prepare(Path(temporary, family), FAMILIES[family])
             for number, way in enumerate(WAYS):
-                figures = measure(subject, way, Path(temporary, family, str(number)))
+                folder = Path(temporary, family, str(number))
+                figures = mean_figures([measure(subject, way, folder / str(seed), seed) for seed in SEEDS])
                 rows.append(
                     {
                         "edit": family,
@@ -150,8 +154,8 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
         "PSNR in dB over the region's pixels of held-out views. agreement: the colors that fit the painted "
         f"views best, against the nearest of {CHOICES} ideal edits. 1: the trained slider likewise; ¼, ½ and "
         "¾ against that edit at the same share of its visible change. evenness: the smallest of "
-        f"{UNIFORM_STEPS} visible steps over the largest. {VIEWS} views of {SIZE} pixels, {GAUSSIANS} "
-        "Gaussians. Own strengths are requested at ¼, ½, ¾ and 1."
+        f"{UNIFORM_STEPS} visible steps over the largest. Means of {len(SEEDS)} seeds. {VIEWS} views of "
+        f"{SIZE} pixels, {GAUSSIANS} Gaussians. Own strengths are requested at ¼, ½, ¾ and 1."
     )
     return [Table.of("ideal-editors", "Text edits with an ideal model", rows, note)]
 
@@ -188,10 +192,29 @@ def prepare(folder: Path, family: Callable[[Small, int], list[Edit]]) -> Subject
     return replace(subject, edits=family(subject.case, CHOICES))
 
 
-def measure(subject: Subject, way: Way, folder: Path) -> SliderFigures:
-    """Paint the views in one way, train the edit, and compare its slider with the ideal edits."""
+def mean_figures(figures: Sequence[SliderFigures]) -> SliderFigures:
+    """Return the means of the figures of one way with several seeds."""
+    agreements = [one.agreement for one in figures if one.agreement is not None]
+    return SliderFigures(
+        calls=round(fmean(one.calls for one in figures)),
+        agreement=fmean(agreements) if agreements else None,
+        end=fmean(one.end for one in figures),
+        between=tuple(map(fmean, zip(*(one.between for one in figures), strict=True))),
+        uniformity=fmean(one.uniformity for one in figures),
+    )
+
+
+def measure(subject: Subject, way: Way, folder: Path, seed: int) -> SliderFigures:
+    """Paint the views in one way, train the edit, and compare its slider with the ideal edits.
+
+    Args:
+        subject: scene, views and ideal edits
+        way: way to call the model
+        folder: new folder of pictures and run
+        seed: seed of the model's noise
+    """
     painter = _painter(subject, way)
-    fit = _paint(subject, way, painter, folder)
+    fit = _paint(subject, way, painter, folder, seed)
     result = train(run_options(subject.folder, folder), quiet=True)
     gdf = load_gdf(result.gdf, subject.scene)
     shown = gdf.field
@@ -215,13 +238,13 @@ def _painter(subject: Subject, way: Way) -> PromptPainter:
     return painter
 
 
-def _paint(subject: Subject, way: Way, painter: PromptPainter, folder: Path) -> Fit | None:
+def _paint(subject: Subject, way: Way, painter: PromptPainter, folder: Path, seed: int) -> Fit | None:
     """Write the pictures of all views at their strengths. Return the colors that fit agreed views best."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     fit = None
     requested: tuple[float, ...] = (*DEGREES, 1.0) if way.degrees == "own strength" else (1.0,)
     if way.agrees:
-        easel = PaintCache(painter, {}, PictureCache(None), 0)  # type: ignore[arg-type]
+        easel = PaintCache(painter, {}, PictureCache(None), seed)  # type: ignore[arg-type]
         style = StyleEditor(lambda picture: picture, {}, PictureCache(None))
         agreed = agree_views(easel, subject.setup, style, RunLog(folder / "agree.txt", quiet=True))
         edit: Edit = agreed.edit
@@ -232,7 +255,7 @@ def _paint(subject: Subject, way: Way, painter: PromptPainter, folder: Path) -> 
     else:
 
         def edit(view: View, strength: float) -> Tensor:
-            return painter.paint(PaintRequest(view.image, strength=strength, seed=0))
+            return painter.paint(PaintRequest(view.image, strength=strength, seed=seed))
 
     for strength in requested:
         place = folder / "edited" / (f"{strength:g}" if len(requested) > 1 else "")

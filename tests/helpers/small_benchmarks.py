@@ -55,6 +55,7 @@ def _shrink_editors(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(ideal_editors, "VIEWS", 8)
     patch.setattr(ideal_editors, "SIZE", 40)
     patch.setattr(ideal_editors, "CHOICES", 3)
+    patch.setattr(ideal_editors, "SEEDS", (0, 10))
 
 
 def shrink_demo(patch: pytest.MonkeyPatch) -> None:
