@@ -422,12 +422,12 @@ def test_sweep_of_a_layer_hidden_by_solo_is_refused(
 
 
 def menu(hand: Rig, layer: int, item: int) -> None:
-    """Right-click a layer's card and pick Rename, Duplicate, Replace, Again or Delete by index."""
+    """Right-click a layer's card and pick an item by index; 6 is Delete."""
     hand.pause(0.5)
     hand.move(LEFT + 150, HEAD + row(layer))
     hand.press(1)
     hand.release(1)
-    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 4 else 0.0))
+    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 6 else 0.0))
 
 
 def test_top_card_is_the_top_layer(hand: Rig) -> None:
@@ -447,7 +447,7 @@ def test_top_card_is_the_top_layer(hand: Rig) -> None:
 def test_layer_deleted_from_its_menu_is_restored_by_undo(hand: Rig) -> None:
     before = hand.main_view.work.view
     picture = hand.picture()
-    menu(hand, 1, 4)
+    menu(hand, 1, 6)
     assert names(hand) == ["scarf"]
     assert hand.main_view.work.focus == 0
     assert not np.array_equal(hand.picture(), picture)
