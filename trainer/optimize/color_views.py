@@ -313,7 +313,7 @@ def draw_color_views(
         window = RasterView.of(camera, gaussians, views[index].box)
         x0, y0, x1, y1 = window.crop
         pixels = _chosen_pixels((y1 - y0, x1 - x0), every, index)
-        image, weighed = rasterize_listed(gaussians, window, background, rows, pixels, OMITTED_WEIGHT)
+        image, _, weighed = rasterize_listed(gaussians, window, background, rows, pixels, OMITTED_WEIGHT)
         return _color_view(weighed, image, pixels, members, camera)
 
     return map_views(draw, range(len(views)), original.device)

@@ -19,10 +19,10 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, activate, render
-from progdf.rasterize.cpu.engine import Array
+from progdf.rasterize.cpu.engine import Array, rasterize_listed
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.cpu.jit import kernel
-from progdf.rasterize.engines import DILATION, ColorMap, color_map
+from progdf.rasterize.engines import DILATION, ColorMap, RasterView, color_map
 from progdf.sh import basis
 from progdf.threads import map_threads, threads
 
@@ -104,8 +104,8 @@ class CropScene:
 
     camera: Camera  # the whole view
     box: Crop  # the pixels that are rendered
-    # the n Gaussians of the box with their colors from this camera; members have the original's values
-    gaussians: ActivatedGaussians
+    scene: Gaussians  # the original
+    index: Tensor  # rows of the n Gaussians of the box in the scene, ascending. [n] int64
     rows: Tensor  # indices of the members among them, in the region's order. [M] int64
     member_shN: Tensor  # higher SH bands of the members in the original. [M,K,3]
     background: Tensor  # rgb. [3]
@@ -113,6 +113,13 @@ class CropScene:
     live: Tensor | None = None  # pixels to draw, others are the original's; None: all. [h,w,1] bool
     still: bool = False  # only the members' colors may differ from the original's
     engine: str = "cpu"  # rasterizer, on the device of the Gaussians
+    weight_map: ColorMap | None = None  # weights of a still view's members; None: made on first use
+
+    @cached_property
+    def gaussians(self) -> ActivatedGaussians:
+        """The Gaussians of the box with their colors from this camera; members have the original's values."""
+        box_scene = self.scene[self.index]
+        return activate(box_scene, seen_colors(box_scene, self.camera))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -206,7 +213,8 @@ class CropScene:
 
     def take(self, members: Tensor) -> CropScene:
         """Return the view for some of its members; the others keep the original's values. [m] int64"""
-        return replace(self, rows=self.rows[members], member_shN=self.member_shN[members])
+        rows = self.rows[members]
+        return replace(self, rows=rows, member_shN=self.member_shN[members], weight_map=None)
 
     def _weights(self, means: Tensor) -> Tensor:
         """Return the weight of each SH band in the members' colors from this camera. [M,3] -> [M,B,1]
@@ -218,14 +226,18 @@ class CropScene:
 
     @cached_property
     def _still_weights(self) -> Tensor:
-        return self._weights(self.gaussians.means[self.rows])
+        return self._weights(self.scene.means[self.index[self.rows]])
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor]:
         """Linear model for constant geometry: each member's weight in each pixel, and the image of all other
         Gaussians."""
-        weight_map = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
-        return weight_map, self.original - weight_map.picture(self.gaussians.colors[self.rows])
+        weight_map = self.weight_map
+        if weight_map is None:
+            gaussians = activate(self.scene, torch.zeros_like(self.scene.means)).select(self.index)
+            weight_map = color_map(gaussians, self.camera, self.box, self.rows, self.engine)
+        members = self.scene[self.index[self.rows]]
+        return weight_map, self.original - weight_map.picture(seen_colors(members, self.camera))
 
     def with_members(self, new: Mapping[str, Tensor]) -> ActivatedGaussians:
         """Return the box's Gaussians with other activated values of the members, by name. [M,...] each"""
@@ -286,37 +298,40 @@ def crop_scene(
     members = members.to(device)
     camera = camera.to(device)
     background = background.to(device)
-    activated = activate(scene, seen_colors(scene, camera))
+    activated = activate(scene)
     member = torch.zeros_like(activated.opacities, dtype=torch.bool).index_fill(0, members, True)
-    output = render(activated, camera, background, crop=box, engine=engine)
+    weight_map: ColorMap | None = None
+    if still and engine == "cpu":
+        window = RasterView.of(camera, activated, box)
+        original, visible, weight_map = rasterize_listed(activated, window, background, members, None, 0.0)
+    else:
+        original, _, info = render(activated, camera, background, crop=box, engine=engine)
+        visible = info.visible
     # members outside the box may move into it
-    index = (output.info.visible | member).nonzero()[:, 0]
+    index = (visible | member).nonzero()[:, 0]
     live = None
-    gaussians = activated.select(index)
     if still:
-        white = member[index, None].to(gaussians.colors).expand(-1, 3).contiguous()
-        member_share = render(
-            gaussians, camera, torch.zeros_like(background), colors=white, crop=box, engine=engine
-        )
-        tiles = live_tiles(member_share.image[..., 0] > 0.0, box)
+        weight_map = weight_map or color_map(activated, camera, box, members, engine)
+        share = weight_map.picture(torch.ones_like(activated.means[members]))
+        tiles = live_tiles(share[..., 0] > 0.0, box)
         pixels = live_pixels(tiles, box)
         if not bool(pixels.all()):
-            reachable = may_reach(gaussians.means, gaussians.scales, camera, tiles)
-            reachable_rows = (reachable | member[index]).nonzero()[:, 0]
+            reachable = may_reach(activated.means[index], activated.scales[index], camera, tiles)
             live = pixels[..., None]
-            index = index[reachable_rows]
-            gaussians = gaussians.select(reachable_rows)
+            index = index[reachable | member[index]]
     return CropScene(
         camera,
         box,
-        gaussians,
+        scene,
+        index,
         rows=torch.searchsorted(index, members),
         member_shN=scene.shN[members],
         background=background,
-        original=output.image,
+        original=original,
         live=live,
         still=still,
         engine=engine,
+        weight_map=weight_map,
     )
 
 

@@ -541,3 +541,5 @@ def accumulate_weights(
             find_spans(lists.members, first, last, splats, x, y, bounds, batch)
             for index in range(first, last):
                 _add_weights(state, batch, np.uint64(index - first) * SPLAT, sums[lists.slots[index]])
+            if not skip_done_rows(state, bounds):
+                break

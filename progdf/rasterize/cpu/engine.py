@@ -103,19 +103,21 @@ def rasterize_part(
 
 
 def rasterize_listed(
-    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, rows: Tensor, pixels: Tensor,
-    lost: float,
-) -> tuple[Tensor, ListedWeights]:  # fmt: skip
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, rows: Tensor,
+    pixels: Tensor | None, lost: float,
+) -> tuple[Tensor, Tensor, ListedWeights]:  # fmt: skip
     """Draw a view, without gradients, and list the weights of some Gaussians in it, after one projection.
 
     Returns:
-        The image, with the bits of `rasterize`; and the map, see `progdf.rasterize.engines.color_map`.
+        The image, with the bits of `rasterize`; the Gaussians visible in the window, see `RasterInfo`, [N]
+        bool; and the map, see `progdf.rasterize.engines.color_map`.
     """
     camera = make_pinhole(view)
     splats, lists = _project_scene(gaussians, camera)
     out = _new_picture(camera, with_last=False)
     share_tiles(blend, camera, splats, lists, camera, to_float32(background).numpy(), out, out.last)
-    return torch.from_numpy(out.image), _list_view(splats, lists, camera, rows, pixels, lost)
+    listed = _list_view(splats, lists, camera, rows, pixels, lost)
+    return torch.from_numpy(out.image), torch.from_numpy(splats.visible), listed
 
 
 def draw_tiles(
