@@ -34,7 +34,7 @@ from progdf.io.images import picture_size, read_picture, saving_loss
 from progdf.io.picture_files import PictureFolder, find_picture, name_key, split_path
 from progdf.rasterize import render
 from trainer.options import EditKind
-from trainer.views.view import BACKGROUND, View, seen_colors, shrink_image
+from trainer.views.view import BACKGROUND, View, shrink_image
 
 from .base import EditorInput
 
@@ -230,7 +230,7 @@ def picture_background(scene: Gaussians, path: Path, camera: Camera) -> Tensor:
 def _draw(scene: Gaussians, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return the scene over the run's background, not clamped, and its transmittance. [H,W,3], [H,W,1]"""
     with torch.no_grad():
-        drawn = render(scene, camera, BACKGROUND, colors=seen_colors(scene, camera))
+        drawn = render(scene, camera, BACKGROUND)
     return drawn.image, drawn.transmittance[..., None]
 
 

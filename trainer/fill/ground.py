@@ -29,7 +29,7 @@ from progdf.surface.models import (
     SurfaceModel,
     fit_planes,
 )
-from trainer.views.view import render_colors, seen_colors
+from trainer.views.view import render_view
 
 REACH_PX = 4.0
 """Largest distance, in pixels of a view, of a point from a surface that still belongs to it."""
@@ -100,7 +100,7 @@ def view_ground(
     if not len(ground):
         return None
     shown = render_depth(ground, eye)
-    image = render_colors(ground, seen_colors(ground, eye), eye, torch.zeros(3))
+    image = render_view(ground, eye, torch.zeros(3))
     image = (image / shown.alpha.clamp_min(1e-3)[..., None]).clamp(0.0, 1.0)
     surface = _model_surface(model, eye, thickness_px)
     known, missing = _known_and_missing(shown.alpha.numpy(), splatted)

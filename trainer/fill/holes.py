@@ -43,7 +43,6 @@ from trainer.views.view import (
     region_box,
     render_colors,
     render_view,
-    seen_colors,
 )
 
 from .ground import REACH_PX, RING_SHARE, Ground, view_ground
@@ -309,7 +308,7 @@ def continued_colors(rest: Gaussians, hole: Hole) -> Tensor:
     """Return the colors of a view, continued into a hole from its boundary. [H,W,3], 0 to 1"""
     camera = hole.camera
     with torch.no_grad():
-        drawn = render(rest, camera, (0.0, 0.0, 0.0), colors=seen_colors(rest, camera))
+        drawn = render(rest, camera, (0.0, 0.0, 0.0))
     alpha = (1.0 - drawn.transmittance)[..., None]
     surface = membrane(torch.cat([drawn.image, alpha], dim=2), hole.mask)
     return (surface[..., :3] / surface[..., 3:].clamp_min(1e-6)).clamp(0.0, 1.0)

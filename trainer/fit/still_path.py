@@ -48,7 +48,7 @@ class StillPath:
         self._node = node
         sh = member_bands(original)
         if sh.shape[1] == 1:  # rows without the higher bands, which the views know
-            sh = torch.cat([sh, crops[0].member_shN], dim=1)[:, :16].contiguous()
+            sh = torch.cat([sh, crops[0].higher_bands], dim=1)[:, :16].contiguous()
         self._original = self._shade(sh, 0.5)
         self._colors: dict[int, Tensor] = {}  # colors at the last two knots, by index. [V,M,3]
 

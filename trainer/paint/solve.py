@@ -83,12 +83,11 @@ def solve_colors(
         if not bool(view.covered.any()):
             continue
         box = box_of(view.covered, view.camera)
-        colors = seen_colors(joined, view.camera)
-        rendered = render(joined, view.camera, BACKGROUND, colors=colors, crop=box).image
+        rendered = render(activated, view.camera, BACKGROUND, crop=box).image
         maps.append(color_map(activated, view.camera, box, free))
         importance.append(1.0 if view.degrees else _OWN_IMPORTANCE)
         missing.append(crop(view.expected, box) - rendered)
-        lowest = torch.maximum(lowest, -colors[free])
+        lowest = torch.maximum(lowest, -seen_colors(joined[free], view.camera))
     ridge = torch.full((len(free), 1), _DISC_RIDGE)
     ridge[:count] = _SCENE_RIDGE + _BEHIND_IMPORTANCE * behind[:, None]
     change = _least_squares(maps, missing, importance, lowest, ridge) / C0
@@ -122,7 +121,7 @@ def solve_shares(
         if not bool(view.covered.any()):
             continue
         box = box_of(view.covered, view.camera)
-        rendered = render(scene, view.camera, BACKGROUND, colors=seen_colors(scene, view.camera), crop=box)
+        rendered = render(activated, view.camera, BACKGROUND, crop=box)
         maps.append(color_map(activated, view.camera, box, rows))
         importance.append(1.0 if view.degrees else _OWN_IMPORTANCE)
         missing.append(crop(view.expected, box) - rendered.image)

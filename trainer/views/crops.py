@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, unpack
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, pack, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, activate, render
 from progdf.rasterize.cpu.engine import Array, rasterize_listed
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
@@ -107,7 +107,6 @@ class CropScene:
     scene: Gaussians  # the original
     index: Tensor  # rows of the n Gaussians of the box in the scene, ascending. [n] int64
     rows: Tensor  # indices of the members among them, in the region's order. [M] int64
-    member_shN: Tensor  # higher SH bands of the members in the original. [M,K,3]
     background: Tensor  # rgb. [3]
     original: Tensor  # the unedited picture, not clamped. [h,w,3]
     live: Tensor | None = None  # pixels to draw, others are the original's; None: all. [h,w,1] bool
@@ -118,8 +117,18 @@ class CropScene:
     @cached_property
     def gaussians(self) -> ActivatedGaussians:
         """The Gaussians of the box with their colors from this camera; members have the original's values."""
-        box_scene = self.scene[self.index]
-        return activate(box_scene, seen_colors(box_scene, self.camera))
+        colors = seen_colors(self.scene[self.index], self.camera)
+        return self._shapes()._replace(colors=colors)
+
+    @property
+    def members(self) -> Tensor:
+        """Rows of the members in the scene. [M] int64"""
+        return self.index[self.rows]
+
+    @cached_property
+    def higher_bands(self) -> Tensor:
+        """Higher SH bands of the members in the original. [M,K,3]"""
+        return self.scene.shN[self.members]
 
     @property
     def size(self) -> tuple[int, int]:
@@ -138,7 +147,7 @@ class CropScene:
         """
         if self.still and not (packed.requires_grad and torch.is_grad_enabled()):
             return self.draw_colors(self.still_colors(packed))
-        members = unpack(packed.to(self.background.device), self.member_shN)
+        members = self._unpack(packed)
         new = {"colors": self._member_colors(members)}
         if "means" in moving:
             new["means"] = members.means
@@ -160,6 +169,19 @@ class CropScene:
         weight_map, remainder = self._linear
         return self._limit(remainder + weight_map.picture(colors))
 
+    def _shapes(self) -> ActivatedGaussians:
+        """Return the box's Gaussians in black.
+
+        The whole scene is activated, as the exponentials of a few rows can differ in their last bits.
+        """
+        return activate(self.scene, torch.zeros_like(self.scene.means)).select(self.index)
+
+    def _unpack(self, packed: Tensor) -> Gaussians:
+        """Return the members of packed rows, with the original's higher bands if the rows hold none."""
+        rows = packed.to(self.background.device)
+        unused = self.scene.shN[:0]
+        return unpack(rows, self.higher_bands if rows.shape[1] == BASE_CHANNELS else unused)
+
     def _limit(self, image: Tensor) -> Tensor:
         """Return an image with the original's pixels where no member is drawn, 0 to 1. [h,w,3]"""
         if self.live is not None:
@@ -177,11 +199,11 @@ class CropScene:
         On the CPU one pass over the rows replaces products of the size of all SH coefficients.
         """
         if self.background.device.type != "cpu":
-            return self._member_colors(unpack(packed.to(self.background.device), self.member_shN))
+            return self._member_colors(self._unpack(packed))
         weights = self._still_weights[..., 0]
         colors = np.full((len(packed), 3), 0.5, np.float32)
         if packed.shape[1] == BASE_CHANNELS:
-            _add_bands(weights[:, 1:].numpy(), self.member_shN.flatten(1).numpy(), 0, colors)
+            _add_bands(weights[:, 1:].numpy(), self.higher_bands.flatten(1).numpy(), 0, colors)
             weights = weights[:, :1]
         rows = packed.detach().contiguous().float().numpy()
         _add_bands(weights.numpy(), rows, BASE_CHANNELS - 3, colors)
@@ -213,8 +235,7 @@ class CropScene:
 
     def take(self, members: Tensor) -> CropScene:
         """Return the view for some of its members; the others keep the original's values. [m] int64"""
-        rows = self.rows[members]
-        return replace(self, rows=rows, member_shN=self.member_shN[members], weight_map=None)
+        return replace(self, rows=self.rows[members], weight_map=None)
 
     def _weights(self, means: Tensor) -> Tensor:
         """Return the weight of each SH band in the members' colors from this camera. [M,3] -> [M,B,1]
@@ -222,11 +243,11 @@ class CropScene:
         Directions are constants, as their share of the means' gradient is small and mostly noise.
         """
         directions = torch.nn.functional.normalize(means.detach() - self.camera.position, dim=1)
-        return basis(min(math.isqrt(self.member_shN.shape[1] + 1) - 1, 3), directions)[..., None]
+        return basis(min(self.scene.sh_degree, 3), directions)[..., None]
 
     @cached_property
     def _still_weights(self) -> Tensor:
-        return self._weights(self.scene.means[self.index[self.rows]])
+        return self._weights(self.scene.means[self.members])
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor]:
@@ -234,10 +255,9 @@ class CropScene:
         Gaussians."""
         weight_map = self.weight_map
         if weight_map is None:
-            gaussians = activate(self.scene, torch.zeros_like(self.scene.means)).select(self.index)
-            weight_map = color_map(gaussians, self.camera, self.box, self.rows, self.engine)
-        members = self.scene[self.index[self.rows]]
-        return weight_map, self.original - weight_map.picture(seen_colors(members, self.camera))
+            weight_map = color_map(self._shapes(), self.camera, self.box, self.rows, self.engine)
+        colors = self.still_colors(pack(self.scene[self.members], with_shN=True))
+        return weight_map, self.original - weight_map.picture(colors)
 
     def with_members(self, new: Mapping[str, Tensor]) -> ActivatedGaussians:
         """Return the box's Gaussians with other activated values of the members, by name. [M,...] each"""
@@ -325,7 +345,6 @@ def crop_scene(
         scene,
         index,
         rows=torch.searchsorted(index, members),
-        member_shN=scene.shN[members],
         background=background,
         original=original,
         live=live,

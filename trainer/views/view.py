@@ -15,7 +15,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.io.picture_files import name_twin, view_name
 from progdf.rasterize import ActivatedGaussians, Crop, activate, render
-from progdf.rasterize.cpu.engine import rasterize_part
+from progdf.rasterize.cpu.engine import rasterize_part, shade_view
 from progdf.rasterize.engines import ColorMap, RasterView, color_map
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding, near_plane, quantile, scene_sphere
@@ -145,6 +145,8 @@ def make_views(scene: Gaussians, region: Region, cameras: Sequence[Camera], back
 
 def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
     """Return each Gaussian's color from this camera, at least 0. [N,3]"""
+    if scene.means.device.type == "cpu":
+        return shade_view(scene, camera)
     directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
     return shade(min(scene.sh_degree, 3), directions, scene.sh)
 

@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
 from progdf.rasterize.engines import (
     FRUSTUM_MARGIN,
     ActivatedGaussians,
@@ -46,6 +48,7 @@ from .forward import (
     depth_order,
     find_tiles,
     project,
+    shade_rows,
 )  # fmt: skip
 from .jit import kernel
 from .parts import PartBuffers, blend_part
@@ -167,6 +170,26 @@ def make_pinhole(view: RasterView) -> Pinhole:
 def to_float32(tensor: Tensor) -> Tensor:
     """Convert a tensor to contiguous float32 on the CPU, as the kernels require."""
     return tensor.to("cpu", torch.float32).contiguous()
+
+
+def shade_view(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """Return each Gaussian's color from a camera, at least 0, with the bits that `rasterize` draws. [N,3]
+
+    `progdf.sh.shade` is the plain version, which takes a copy of all coefficients and several of their size.
+    """
+    means = to_float32(gaussians.means).detach().numpy()
+    sh0 = to_float32(gaussians.sh0).detach().numpy()
+    shN = to_float32(gaussians.shN).detach().numpy()
+    window = (0, 0, camera.width, camera.height)
+    degree = min(gaussians.sh_degree, 3)
+    pinhole = make_pinhole(
+        RasterView(camera.viewmat, camera.K, camera.width, camera.height, window, sh_degree=degree)
+    )
+    colors = np.empty((len(gaussians), 3), np.float32)
+    share_gaussians(
+        lambda begin, end: shade_rows(begin, end, means, sh0, shN, pinhole, np.empty(16), colors), len(colors)
+    )
+    return torch.from_numpy(colors)
 
 
 def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, TileLists]:

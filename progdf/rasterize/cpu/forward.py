@@ -333,6 +333,34 @@ def shade_splat(mean: Vec, colors: Array, degree: int, eye: Vec, basis: Array) -
 
 
 @kernel(contract=True, cache=True)
+def shade_rows(
+    begin: int, end: int, means: Array, sh0: Array, shN: Array, camera: Pinhole, basis: Array, colors: Array
+) -> None:
+    """Compute the colors of Gaussians begin … end − 1 as `project` does, at least 0; NaN remains.
+
+    Args:
+        means, sh0, shN: of all Gaussians. [N,3], [N,3], [N,K,3]
+        camera: its SH degree is 0 to 3
+        basis: scratch. [16] float64
+        colors: out, rows begin … end − 1. [N,3]
+    """
+    eye = camera_center(camera)
+    for i in range(begin, end):
+        dx, dy, dz, _ = view_direction(vec(means, i), eye)
+        fill_basis(camera.degree, dx, dy, dz, basis)
+        red = 0.5 + basis[0] * sh0[i, 0]
+        green = 0.5 + basis[0] * sh0[i, 1]
+        blue = 0.5 + basis[0] * sh0[i, 2]
+        for band in range(1, (camera.degree + 1) ** 2):
+            red += basis[band] * shN[i, band - 1, 0]
+            green += basis[band] * shN[i, band - 1, 1]
+            blue += basis[band] * shN[i, band - 1, 2]
+        colors[i, 0] = 0.0 if red < 0.0 else red
+        colors[i, 1] = 0.0 if green < 0.0 else green
+        colors[i, 2] = 0.0 if blue < 0.0 else blue
+
+
+@kernel(contract=True, cache=True)
 def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats, basis: Array) -> None:
     """Project Gaussians begin … end − 1.
 

@@ -16,7 +16,15 @@ from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.region import from_mask
 from progdf.scene.bounds import scene_sphere
-from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
+from progdf.sh import shade
+from tests.helpers.scenes import (
+    ball,
+    concatenate,
+    front_camera,
+    one_gaussian,
+    orbit_camera,
+    random_gaussians,
+)
 from tests.helpers.trained import small
 from trainer.editors import check_new_editor, make_editor
 from trainer.editors.pictures import FolderEditor, photographs_note
@@ -185,6 +193,18 @@ def test_view_shows_the_scene_and_the_color_of_its_region() -> None:
     assert int(alone.sum()) > 100
     own = seen_colors(scene, camera)[1].clamp(0, 1)
     torch.testing.assert_close(view.inside[alone], own.expand(int(alone.sum()), 3), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colors_of_a_view_match_plain_sh_and_the_rasterizer(degree: int) -> None:
+    scene = random_gaussians(2000, seed=degree, sh_degree=degree)
+    scene.sh0[7] = torch.nan
+    camera = orbit_camera(64, 40)
+    colors = seen_colors(scene, camera)
+    directions = torch.nn.functional.normalize(scene.means - camera.position, dim=1)
+    expected = shade(degree, directions, scene.sh)
+    torch.testing.assert_close(colors, expected, atol=1e-6, rtol=0, equal_nan=True)
+    assert torch.equal(render(scene, camera, colors=colors).image, render(scene, camera).image)
 
 
 @pytest.mark.parametrize(
