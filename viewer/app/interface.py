@@ -11,7 +11,7 @@ from progdf.errors import ProgdfError
 from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
 from viewer.panel.card import BLEND_TITLES
 from viewer.pictures.compare import Labels
-from viewer.state import history, tour, workspace
+from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem, Plain
 from viewer.state.transient import Pull
@@ -284,7 +284,7 @@ def over_picture(
                 work = perform_actions(work, [line.button[1]], pointer)
     if work.transient.tour is not None and view.panel:
         bottom = min(free.y, above.height)
-        work, requested = tour_card.draw(tour.follow(work, imgui.is_any_mouse_down()), area.width, bottom, ui)
+        work, requested = tour_card.draw(work, area.width, bottom, ui)
         work = perform_actions(work, [requested] if requested is not None else [], pointer)
     if work.help:
         query, pressed = key_list.draw(work.help_query, free, ui)

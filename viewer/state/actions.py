@@ -20,7 +20,7 @@ from viewer.camera.view_camera import FARTHEST
 from viewer.camera.views import look_at_view
 from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, with_settings
 
-from . import history, layer_selection, paint, selection, snapshots, timeline, tour
+from . import history, layer_selection, paint, selection, snapshots, timeline
 from .commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename, WithValue, argument
 from .history import History
 from .layers import (
@@ -45,6 +45,7 @@ from .workspace import (
     focus_layer,
     is_compact,
     loses_strengths,
+    start_tour,
     with_camera,
     with_layers_of,
     with_transient,
@@ -568,7 +569,7 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "view_mode": _set_mode,
     "next_view_mode": lambda w, _: _next_value(w, "mode", VIEW_MODES),
     "safe_frame": lambda w, _: _next_value(w, "safe_frame", FRAMES),
-    "tour": lambda workspace, _: tour.start(workspace),
+    "tour": lambda workspace, _: start_tour(workspace),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help, help_query=""),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),

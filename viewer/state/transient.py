@@ -474,7 +474,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Tour:
-    """Tour of the window, see `viewer.state.tour`."""
+    """Tour of the window, see `viewer.state.workspace.follow_tour`."""
 
     step: int  # index of the current step
     before: object = field(compare=False)  # value of the step when it began

@@ -30,7 +30,7 @@ from .history import Edit, History
 from .selection import SelectionState
 from .snapshots import SliderSnapshot
 from .timeline import Player
-from .transient import Transient
+from .transient import Tour, Transient
 from .view_state import Comparison, ViewState
 
 MESSAGE_S = 6.0  # time that a message stays visible, s
@@ -402,3 +402,51 @@ def with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
         positions = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
         focus = focus if focus in positions else next(iter(positions), None)
     return replace(workspace, view=view, focus=focus)
+
+
+_SHARES = ("export", "export_page", "render_picture", "render_film")
+"""Dialogs that export something."""
+
+TOUR_STEPS: dict[str, Callable[[Workspace], object]] = {
+    "move": lambda work: work.view.camera,
+    "slide": lambda work: tuple(layer.strength for layer in work.view.layers),
+    "scribble": lambda work: [strokes for strokes in work.transient.tool.strokes if len(strokes.beside)],
+    "grade": lambda work: work.form_open and work.form.choice.setting == "grade",
+    "share": lambda work: work.dialog is not None and work.dialog.kind in _SHARES,
+}
+"""Name of each step of the tour, and the value whose change finishes it."""
+STEP_NAMES = (*TOUR_STEPS,)
+
+
+def start_tour(work: Workspace) -> Workspace:
+    """Start the tour from its first step."""
+    return _to_step(work, 0)
+
+
+def follow_tour(work: Workspace, held: bool) -> Workspace:
+    """Go to the next step of the tour if the user has done the current one.
+
+    Args:
+        held: a mouse button is down, so that the action is not finished
+    """
+    tour = work.transient.tour
+    if tour is None or held:
+        return work
+    return work if TOUR_STEPS[STEP_NAMES[tour.step]](work) == tour.before else skip_step(work)
+
+
+def skip_step(work: Workspace) -> Workspace:
+    """Go to the next step of the tour; end it after the last one."""
+    tour = work.transient.tour
+    if tour is None or tour.step + 1 == len(STEP_NAMES):
+        return end_tour(work)
+    return _to_step(work, tour.step + 1)
+
+
+def end_tour(work: Workspace) -> Workspace:
+    """End the tour, so that no example starts it again."""
+    return replace(with_transient(work, tour=None), layout=replace(work.layout, toured=True))
+
+
+def _to_step(work: Workspace, step: int) -> Workspace:
+    return with_transient(work, tour=Tour(step, TOUR_STEPS[STEP_NAMES[step]](work)))

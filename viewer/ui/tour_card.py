@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from imgui_bundle import imgui, imgui_ctx
 
-from viewer.state import tour
-from viewer.state.commands import Action
-from viewer.state.workspace import Workspace
+from viewer.state.commands import Action, Plain, WithText
+from viewer.state.workspace import STEP_NAMES, Workspace, end_tour, follow_tour, skip_step
 
 from .context import PALETTE, SMALL_PX, UiContext
 from .keys import shortcut
@@ -26,11 +25,17 @@ _TEXTS = {
     "grade": ("Grade", "Open a new edit{key} and choose the editor Grade. Its sliders act at once."),
     "share": ("Share", "Export a web page{key}: one file, with your sliders, for any browser."),
 }
+_BUTTONS: dict[str, tuple[str, Action]] = {
+    "scribble": ("Scribble", WithText("select_tool", "scribble")),
+    "grade": ("New edit…", Plain("new_edit")),
+    "share": ("Web page…", Plain("export_page")),
+}
+"""Label and command of the button of a step."""
 _KEYS = {"scribble": "select_tool:scribble", "grade": "new_edit", "share": "export_page"}
 
 
 def draw(work: Workspace, right: float, bottom: float, ui: UiContext) -> tuple[Workspace, Action | None]:
-    """Draw the current step of the tour, if it runs.
+    """Draw the current step of the tour, if it runs, or the next one if the user has done it.
 
     Args:
         work: the state to show and change
@@ -41,10 +46,11 @@ def draw(work: Workspace, right: float, bottom: float, ui: UiContext) -> tuple[W
     Returns:
         The workspace; the action of the step's button, None for none.
     """
+    work = follow_tour(work, imgui.is_any_mouse_down())
     running = work.transient.tour
     if running is None:
         return work, None
-    name = tour.NAMES[running.step]
+    name = STEP_NAMES[running.step]
     title, text = _TEXTS[name]
     key = shortcut(_KEYS[name]) if name in _KEYS else ""
     text = text.format(key=f" ({key})" if key else "")
@@ -52,7 +58,7 @@ def draw(work: Workspace, right: float, bottom: float, ui: UiContext) -> tuple[W
     requested = None
     size = (min(WIDE_PX * ui.scale, right - 2 * edge), 0.0)
     with plate("tour", (right - edge, bottom - edge), ui, (1.0, 1.0), _PAD_PX, size):
-        count = f"{running.step + 1} of {len(tour.NAMES)}"
+        count = f"{running.step + 1} of {len(STEP_NAMES)}"
         with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
             imgui.text(title)
         with imgui_ctx.push_font(None, SMALL_PX):
@@ -62,15 +68,15 @@ def draw(work: Workspace, right: float, bottom: float, ui: UiContext) -> tuple[W
             imgui.text_colored(PALETTE.text, text)
         imgui.dummy((0.0, 2.0 * ui.scale))
         if imgui.button("Skip"):
-            work = tour.end(work)
-        if name in tour.BUTTONS:
-            label, action = tour.BUTTONS[name]
+            work = end_tour(work)
+        if name in _BUTTONS:
+            label, action = _BUTTONS[name]
             imgui.same_line()
             if imgui.button(label):
                 requested = action
-        next_text = "Done" if running.step + 1 == len(tour.NAMES) else "Next"
+        next_text = "Done" if running.step + 1 == len(STEP_NAMES) else "Next"
         wide = imgui.calc_text_size(next_text).x + 4 * imgui.get_style().frame_padding.x
         imgui.same_line(size[0] - _PAD_PX * ui.scale - wide)
         if accent_button(next_text, (wide, 0.0)):
-            work = tour.skip_step(work)
+            work = skip_step(work)
     return work, requested

@@ -17,9 +17,8 @@ from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
 from viewer.app.decal import DecalTextures
-from viewer.state import tour
 from viewer.state.commands import Plain
-from viewer.state.workspace import with_question, with_transient
+from viewer.state.workspace import start_tour, with_question, with_transient
 from viewer.ui.glfw_library import glfw
 
 pytestmark = pytest.mark.gl
@@ -92,7 +91,7 @@ def test_no_bar_covers_another(app: App, folder: Path, size: str) -> None:
     glfw.set_window_size(app.window.handle, *points)
     first = replace(app.main_view.work, layout=replace(app.main_view.work.layout, zoom=zoom))
     buttons = [("Flip", Plain("flip_up")), ("Choose…", Plain("view_settings"))]
-    first = tour.start(with_question(first, "Guessed −Y as up", buttons))
+    first = start_tour(with_question(first, "Guessed −Y as up", buttons))
     for state in STATES:
         app.main_view.store.replace(first)
         rest(app)

@@ -10,10 +10,9 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
-from viewer.state import tour
 from viewer.state.commands import WithText
 from viewer.state.forms import DeliverOptions
-from viewer.state.workspace import PLACES, Dialog
+from viewer.state.workspace import PLACES, Dialog, start_tour
 
 pytestmark = pytest.mark.gl
 
@@ -51,7 +50,7 @@ def test_f6_cycles_through_all_visible_parts_and_the_picture(hand: Rig) -> None:
             assert bool(focused()) or not name, "one sees where it is"
     strike(hand, "J")
     strike(hand, "T")
-    hand.main_view.store.replace(tour.start(hand.main_view.work))
+    hand.main_view.store.replace(start_tour(hand.main_view.work))
     hand.settle()
     for name in (*PLACES, ""):
         strike(hand, "F6")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.helpers.ui_rig import bear, first_view
-from viewer.state import tour
+from viewer.state import workspace
 from viewer.state.forms import EDITORS, NewEdit
 from viewer.state.transient import Strokes, Tour
 from viewer.state.workspace import Dialog, Workspace, new_workspace, with_tool, with_transient
@@ -17,9 +17,9 @@ GRADE = next(i for i, editor in enumerate(EDITORS) if editor.setting == "grade")
 
 def running(name: str) -> Workspace:
     """Return a workspace in this step of the tour."""
-    work = tour.start(new_workspace(first_view(bear(), 0.5, 0.5)))
-    for _ in range(tour.NAMES.index(name)):
-        work = tour.skip_step(work)
+    work = workspace.start_tour(new_workspace(first_view(bear(), 0.5, 0.5)))
+    for _ in range(workspace.STEP_NAMES.index(name)):
+        work = workspace.skip_step(work)
     return work
 
 
@@ -41,28 +41,28 @@ def done(name: str) -> Workspace:
 
 
 def test_each_action_finishes_its_own_step_only() -> None:
-    for name in tour.NAMES[:-1]:
-        for step in tour.NAMES:
+    for name in workspace.STEP_NAMES[:-1]:
+        for step in workspace.STEP_NAMES:
             work = with_transient(done(step), tour=running(name).transient.tour)
-            after = tour.follow(work, held=False).transient.tour
+            after = workspace.follow_tour(work, held=False).transient.tour
             assert isinstance(after, Tour)
-            assert (after.step > tour.NAMES.index(name)) == (step == name), (name, step)
+            assert (after.step > workspace.STEP_NAMES.index(name)) == (step == name), (name, step)
 
 
 def test_step_lasts_until_the_mouse_button_is_released() -> None:
-    for name in tour.NAMES:
+    for name in workspace.STEP_NAMES:
         work = done(name)
-        assert tour.follow(work, held=True) is work
+        assert workspace.follow_tour(work, held=True) is work
 
 
 def test_tour_ends_after_the_last_step_or_when_it_is_skipped() -> None:
-    for ended in (tour.follow(done("share"), held=False), tour.end(running("slide"))):
+    for ended in (workspace.follow_tour(done("share"), held=False), workspace.end_tour(running("slide"))):
         assert ended.transient.tour is None
         assert ended.layout.toured
 
 
 def test_next_step_starts_with_the_present_state() -> None:
-    moved = tour.follow(done("move"), held=False)
-    assert tour.follow(moved, held=False) is moved
-    work = with_transient(done("slide"), tour=Tour(1, tour.STEPS["slide"](done("slide"))))
-    assert tour.follow(work, held=False) is work
+    moved = workspace.follow_tour(done("move"), held=False)
+    assert workspace.follow_tour(moved, held=False) is moved
+    work = with_transient(done("slide"), tour=Tour(1, workspace.TOUR_STEPS["slide"](done("slide"))))
+    assert workspace.follow_tour(work, held=False) is work

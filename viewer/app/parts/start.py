@@ -24,10 +24,10 @@ from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.panel.pages import folder_name
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
-from viewer.state import history, tour
+from viewer.state import history
 from viewer.state.transient import StartFile
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import Store, with_transient
+from viewer.state.workspace import Store, start_tour, with_transient
 
 POLL_S = 0.5
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -169,7 +169,7 @@ class StartActions:
         if work.layout.toured or work.transient.tour is not None or path is None:
             return
         if path.is_relative_to(self._examples):
-            self._store.replace(tour.start(work))
+            self._store.replace(start_tour(work))
             self._store.wake()
 
     def _publish(self) -> None:
