@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
 import numpy as np
@@ -187,7 +188,7 @@ def rig(
     density: float = 1.0,
     scale: float = 1.0,
     stack: Stack | None = None,
-    pictures: Path = Path(),
+    pictures: Path | None = None,
     draw: str = "cpu",
 ) -> Iterator[Rig]:
     """Open a main view on the bear.
@@ -197,13 +198,16 @@ def rig(
         points: size of the window in its own coordinates
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
+        pictures: folder of saved pictures; None is a folder that is removed at the end
         draw: renderer of the splats, as for the engine
     """
     stack = stack or bear()
     context = headless_context()
     engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
     facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
-    main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
+    spare = TemporaryDirectory()
+    folder = pictures or Path(spare.name)
+    main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, folder)
     new_rig = Rig(main_view, points, density)
     try:
         with patch.object(imgui.backends, "opengl3_render_draw_data", new_rig.render):
@@ -212,3 +216,4 @@ def rig(
         main_view.close()
         engine.release()
         context.release()
+        spare.cleanup()
