@@ -57,7 +57,7 @@ def test_new_scene_keeps_only_the_window_settings() -> None:
     view = replace(view, panel=False, grid=True, select=SelectTool("flood"), overshoot=True)
     picture = packed_picture(view.camera, (2, 2), np.full((2, 2, 4), 255, np.uint8))
     view = replace(view, color_brush=ColorBrush("clone"), painted=(picture,))
-    view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1")
+    view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1", mode="rings")
     plain = ViewState()
     changed = {
         field.name for field in fields(ViewState) if getattr(view, field.name) != getattr(plain, field.name)

@@ -165,6 +165,10 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requested = []
+    gray = np.full((2, 2, 3), 0.5, np.float32)
+    rows = np.arange(5)
+    whole = np.ones((2, 2), np.float32)
+    sample = preview_process.RegionSample(rows, gray[0], whole[0], gray, gray, whole)
 
     def ask(self: Previews, region: str, request: preview_process.PreviewInputs, _: Camera) -> int:
         self._number += 1
@@ -172,7 +176,7 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
         answer = preview_process.Preview(self._number, grade=Previews.grade, made="grade")
         if request.editor == "grade":
             colors = ("#7eae44", f"#0000{self._number:02x}")
-            answer = preview_process.Preview(self._number, made="palette", palette=colors)
+            answer = preview_process.Preview(self._number, made="palette", palette=colors, sample=sample)
         self._answers.append(answer)
         return self._number
 
@@ -183,7 +187,9 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
     assert (requested, window.main_view.work.transient.live) == (["grade"], ())
     with_form(window, palette=(("#7eae44", "#3060d0"), form.palette[1]))
     assert requested[1:] == ["grade:#7eae44=#3060d0,#000001"]
-    assert len(window.main_view.work.transient.live) == 1
+    shown = window.engine.live
+    assert shown is not None
+    assert np.array_equal(shown.rows, rows)
     with_form(window, region="typed", typed_region="sphere:0,0,0,9")
     assert requested[2] == "grade"
     assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"

@@ -100,7 +100,7 @@ def test_shader_heads_document_inputs_and_outputs() -> None:
 def test_include_is_inserted_once_and_keeps_line_numbers() -> None:
     source = load_source("project.vert")
     assert source.files[0] == "project.vert"
-    assert len(set(source.files)) == len(source.files) == 5
+    assert len(set(source.files)) == len(source.files) == 6
     assert source.text.count("const float DILATION") == 1
     lines = source.text.splitlines()
     after = next(i for i, line in enumerate(lines) if line.startswith("in uint splat"))
