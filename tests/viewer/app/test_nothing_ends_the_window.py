@@ -23,7 +23,7 @@ from viewer.panel import card, cards, snapshot_cards, timeline_bar, tools
 from viewer.state import actions, selection, timeline
 from viewer.state.commands import Plain
 from viewer.state.workspace import Message
-from viewer.ui import overlay
+from viewer.ui import key_list, overlay
 
 pytestmark = pytest.mark.gl
 
@@ -45,7 +45,7 @@ DRAWN = {
     "the timeline": (timeline_bar, "draw"),
     "the mouse": (mouse, "_drag"),
     "the axes": (overlay, "draw_axes"),
-    "the keys": (interface, "_column"),
+    "the keys": (key_list, "_column"),
 }
 """Parts of a frame, each with the function that is replaced by one that raises."""
 
