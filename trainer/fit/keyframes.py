@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -18,10 +19,15 @@ from progdf.field import BakedField
 from progdf.field.baked import SliderRemap, identity_remap
 from progdf.field.grade import member_bands, sphere
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
+from progdf.threads import map_threads
 from trainer.views.setup import TrainingSetup
 
 from .evaluate import Evaluator
 from .slider_uniformity import equalizing_slider
+
+_OKLAB_KNOTS = 9
+"""Knots of a path in OKLab that is re-timed; between them the path is taken as straight."""
+_BLOCK = 2048  # members whose colors from all directions fit into a processor's cache
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,11 @@ class TwoKeyframes:
     attributes: tuple[str, ...]  # names of the attributes that change
     in_oklab: bool  # color from every direction: straight in OKLab, or in raw parameters
     timing: SliderRemap = identity_remap()  # from slider values to strengths on the line
+
+    @property
+    def knots(self) -> Tensor:
+        """Strengths between which a path of colors is nearly straight, ascending from 0 to 1. [S] float64"""
+        return torch.linspace(0, 1, _OKLAB_KNOTS if self.in_oklab else 2, dtype=torch.float64)
 
     @property
     def bytes_per_member(self) -> float:
@@ -49,31 +60,54 @@ class TwoKeyframes:
         moved = s * self.end
         if not self.in_oklab or s in (0.0, 1.0) or not {"sh0", "shN"} & set(self.attributes):
             return moved
-        before = member_bands(self.start)
-        after = member_bands(self.start + self.end)
-        change = (_mix_in_oklab(before, after, s) - before).flatten(1)
+        change = self._path.change(s).flatten(1)
         first = BASE_CHANNELS - 3  # column of band 0
         moved[:, first : first + change.shape[1]] = change
         return moved
 
+    @cached_property
+    def _path(self) -> _OklabPath:
+        return _OklabPath(member_bands(self.start), member_bands(self.start + self.end))
 
-def _mix_in_oklab(before: Tensor, after: Tensor, s: float) -> Tensor:
-    """Return the SH coefficients whose colors lie between two others, straight in OKLab from every direction.
+
+_Colors = tuple[Tensor, Tensor]
+"""Colors in OKLab, and their part outside the range of a screen. [M,D,3] each"""
+
+
+class _OklabPath:
+    """SH coefficients whose colors lie between two others, straight in OKLab from every direction.
+
+    The colors of both ends from every direction stay in memory, 768 bytes per member.
 
     Args:
         before, after: coefficients of the ends. [M,B,3]
-        s: share of `after`, 0 to 1
     """
-    degree = math.isqrt(before.shape[1]) - 1
-    functions, inverse = sphere(degree, before.device)
-    start = torch.einsum("db,mbc->mdc", functions, before) + 0.5
-    end = torch.einsum("db,mbc->mdc", functions, after) + 0.5
-    start_rgb = start.clamp(0.0, 1.0)
-    end_rgb = end.clamp(0.0, 1.0)
-    lab = torch.lerp(srgb_to_oklab(start_rgb), srgb_to_oklab(end_rgb), s)
-    # the part outside the range of a screen is interpolated linearly
-    beyond = torch.lerp(start - start_rgb, end - end_rgb, s)
-    return torch.einsum("bd,mdc->mbc", inverse, oklab_to_srgb(lab) + beyond - 0.5)
+
+    def __init__(self, before: Tensor, after: Tensor) -> None:
+        degree = math.isqrt(before.shape[1]) - 1
+        self._before = before
+        self._functions, self._inverse = sphere(degree, before.device)
+
+        def ends(begin: int) -> tuple[_Colors, _Colors]:
+            block = slice(begin, begin + _BLOCK)
+            return self._colors(before[block]), self._colors(after[block])
+
+        self._ends = map_threads(ends, range(0, len(before), _BLOCK))
+
+    def change(self, share: float) -> Tensor:
+        """Return the change of the coefficients at a share of `after`, 0 to 1. -> [M,B,3]"""
+        return torch.cat(map_threads(lambda ends: self._mix(*ends, share), self._ends)) - self._before
+
+    def _colors(self, sh: Tensor) -> _Colors:
+        """Return the colors from every direction in OKLab, and their part outside the range of a screen."""
+        rgb = torch.einsum("db,mbc->mdc", self._functions, sh) + 0.5
+        shown = rgb.clamp(0.0, 1.0)
+        return srgb_to_oklab(shown), rgb - shown
+
+    def _mix(self, before: _Colors, after: _Colors, share: float) -> Tensor:
+        lab = torch.lerp(before[0], after[0], share)
+        beyond = torch.lerp(before[1], after[1], share)  # what a screen cannot show is interpolated linearly
+        return torch.einsum("bd,mdc->mbc", self._inverse, oklab_to_srgb(lab) + beyond - 0.5)
 
 
 def closest_keyframes(

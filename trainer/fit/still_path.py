@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.field.baked import BakedField, find_segment
+from progdf.field.baked import find_segment
+from progdf.field.choose import Field
 from progdf.field.grade import member_bands
 from progdf.gaussians import attribute_slices
 from progdf.threads import map_threads
@@ -82,17 +84,27 @@ class StillPath:
         return torch.from_numpy(np.concatenate(colors))
 
 
+@runtime_checkable
+class KnottedField(Field, Protocol):
+    """Field whose path is straight between knots, or nearly so."""
+
+    @property
+    def knots(self) -> Tensor:
+        """Strengths of the knots, ascending from 0 to 1. [S]"""
+        ...
+
+
 def still_path(
-    crops: Sequence[CropScene], original: Tensor, field: object
+    crops: Sequence[CropScene], original: Tensor, field: Field
 ) -> Callable[[float], list[Tensor]] | None:
-    """Return the pictures of a field by `StillPath`; None if it changes more than colors, or is not linear.
+    """Return the pictures of a field by `StillPath`; None if it changes more than colors or has no knots.
 
     Args:
         crops: views
         original: raw member rows, packed. [M,C]
         field: any field
     """
-    if not isinstance(field, BakedField) or not field.attributes or set(field.attributes) & set(GEOMETRY):
+    if not isinstance(field, KnottedField) or not field.attributes or set(field.attributes) & set(GEOMETRY):
         return None
     if not all(crop.still and crop.original.is_cpu for crop in crops):
         return None
