@@ -10,7 +10,7 @@ from imgui_bundle import imgui, imgui_ctx
 from progdf.errors import ProgdfError
 from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
 from viewer.panel.card import BLEND_TITLES
-from viewer.pictures.compare import Labels
+from viewer.pictures.compare import PHOTOGRAPH, Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.commands import Action, OnItem, Plain
@@ -224,7 +224,9 @@ def draw_pill(
         The workspace; the requested actions.
     """
     words, original = compared
-    if work.transient.has_bar or not (work.view.layers or original or work.view.compare.mode != "off"):
+    compare = work.view.compare
+    is_useful = work.view.layers or original or compare.mode != "off" or compare.against == PHOTOGRAPH
+    if work.transient.has_bar or not is_useful:
         return work, []
     scale = pointer.ui.scale
     wide = pointer.area.width

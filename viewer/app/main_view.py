@@ -170,6 +170,7 @@ class MainView:
             clone=None,
             pending=(),
             viewpoints=(),
+            through=None,
             tour=None,
         )
         self.store.replace(
@@ -263,6 +264,7 @@ class MainView:
             self.store.replace(workspace.record_undo(self.work))
         if self.work.view.layers != before.view.layers:
             self.store.replace(replace(self.work, before=False))
+        self.store.replace(frusta.leave_camera(self.work))
         if self.work != before:
             self.store.replace(actions.end_at_edit(before, self.work))
             self.wake()
@@ -271,12 +273,13 @@ class MainView:
         view = self._displayed_view()
         area = self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
+        self.canvas.comparer.photograph = frusta.compared_view(self.work, self.work.view)[1]
         pointed = self.work.pointed if view.panel else None
         held = self._is_held()
         transient = self.work.transient
         live = bool(transient.live)
-        pull = transient.gizmo if isinstance(transient.gizmo, Pull) else None
-        pulled = pull.influence if pull is not None and pull.is_held else None
+        pull = transient.held_pull
+        pulled = None if pull is None else pull.influence
         focus = self.work.focus
         guessed = select_tool.guessed_rows(self.work)
         self.canvas.draw(
@@ -472,7 +475,8 @@ class MainView:
         frame = self._frame()
         if frame is not None:
             view = overlay.fit_to_frame(view, frame, self._area())
-        if self.work.before:
+        view, photograph = frusta.compared_view(self.work, view)
+        if self.work.before and photograph is None:
             return workspace.original(view)
         sides = compare_sides(self.work.snapshots, view)
         if sides is not None:
@@ -496,14 +500,9 @@ class MainView:
 
     def _is_held(self) -> bool:
         """Return True if the user's input or a playing film moves the picture."""
-        if (
-            self.work.transient.tool.drag is not None
-            or imgui.is_any_item_active()
-            or imgui.get_io().mouse_wheel
-        ):
-            return True
-        pull = self.work.transient.gizmo
-        if isinstance(pull, Pull) and pull.is_held:
+        transient = self.work.transient
+        is_dragged = transient.tool.drag is not None or transient.held_pull is not None
+        if is_dragged or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         moves = self.work.player.playing or self.work.glide is not None
         return moves or is_flying(self._keys) or is_repeating(self._keys)

@@ -135,7 +135,7 @@ def _handle_release(work: Workspace, pointer: PointerContext) -> Workspace:
         if work.view.color_brush.tool:
             work = color_tool.pick(work, pointer)
         elif (viewpoint := frusta.under(work, pointer)) is not None:
-            work = frusta.look_through(work, viewpoint)
+            work = frusta.look_through(work, viewpoint, pointer)
         else:
             work = _focus_picked_layer(work, pointer)
     if tool.drag == color_tool.COLOR_DRAG and imgui.is_mouse_released(0):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import TypeVar
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.pictures.compare import Labels
 from viewer.render import highlight
@@ -27,7 +28,7 @@ from viewer.state.view_state import (
 )
 from viewer.state.workspace import Pointed, Workspace
 from viewer.ui import overlay
-from viewer.ui.context import PALETTE, Icon, UiContext, u32
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.keys import COMMANDS, MODES, shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
@@ -461,7 +462,13 @@ _COMPARISONS = ("beside", "split", "difference")
 _AGAINST = (
     ("original", "Against the original", ""),
     ("snapshots", "Snapshot A against B", "compare_snapshots"),
+    ("photograph", "Against the photograph", ""),
 )
+_MISSING_SIDES = {
+    "snapshots": "Add a snapshot first",
+    "photograph": "Click a training camera with a photograph first",
+}
+"""Reasons why a comparison is not available."""
 
 
 def draw_comparison(
@@ -505,9 +512,19 @@ def draw_comparison(
         imgui.pop_style_var()
         open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:
-            compare = _choose_comparison(compare, bool(work.snapshots), ui) if is_open else compare
+            compare = _choose_comparison(compare, _sides(work), ui) if is_open else compare
+        (left, top), size = imgui.get_window_pos(), imgui.get_window_size()
+    if words.note:
+        _draw_note(words.note, (left + 0.5 * size.x, top + size.y), ui)
     work = replace(work, view=replace(work.view, compare=compare))
     return work, Plain(requested) if requested else None
+
+
+def _draw_note(text: str, at: tuple[float, float], ui: UiContext) -> None:
+    """Draw a small line centered below the pill. `at`: middle of the pill's lower edge, window pixels"""
+    place = (at[0], at[1] + PAD_PX * ui.scale)
+    with plate("comparison note", place, ui, (0.5, 0.0), PAD_PX), imgui_ctx.push_font(None, SMALL_PX):
+        imgui.text(elide(text, 2.0 * (at[0] - LEFT_PX * ui.scale)))
 
 
 def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
@@ -519,7 +536,16 @@ def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
     return bool(pressed)
 
 
-def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> Comparison:
+def _sides(work: Workspace) -> tuple[str, ...]:
+    """Return the available values of `Comparison.against`."""
+    through = work.transient.through
+    has_photograph = through is not None and through.photograph is not None
+    available = {"original": True, "snapshots": bool(work.snapshots), "photograph": has_photograph}
+    return tuple(name for name, is_available in available.items() if is_available)
+
+
+def _choose_comparison(compare: Comparison, sides: Sequence[str], ui: UiContext) -> Comparison:
+    """Draw the menu and return the chosen comparison. `sides`: available values of `Comparison.against`"""
     if imgui.menu_item("Edited only", "", compare.mode == "off")[0]:
         compare = replace(compare, mode="off")
     for mode in _COMPARISONS:
@@ -527,13 +553,13 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
             compare = replace(compare, mode=mode)
     imgui.separator()
     for against, text, action in _AGAINST:
-        is_available = snapshots or against == "original"
+        is_available = against in sides
         if imgui.menu_item(text, shortcut(action), compare.against == against, is_available)[0]:
             compare = replace(
                 compare, against=against, mode="split" if compare.mode == "off" else compare.mode
             )
         if not is_available:
-            tip("Add a snapshot first")
+            tip(_MISSING_SIDES[against])
     if compare.mode == "difference":
         ends = 1.0, MAX_AMPLIFIED
         gain = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.painting.projection import ViewSurface
@@ -16,6 +17,7 @@ from progdf.painting.strokes import ColorStroke
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import Centers, Mask, Surface
 from viewer.camera.decal_warp import DecalFrame, DecalMesh
+from viewer.camera.photograph import Photograph
 from viewer.camera.view_camera import Vec3, ViewCamera
 
 from .paint import Stroke
@@ -470,6 +472,15 @@ class Viewpoint:
     eye: Vec3  # its center, world units
     corners: tuple[Vec3, ...]  # corners of its picture, from the upper left one clockwise. [4]
     picture: Path | None = None  # its photograph
+    camera: Camera | None = field(default=None, compare=False)  # the camera with its size and lens
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """View through a training camera."""
+
+    view: ViewCamera  # view with the whole photograph; another view is none through the camera
+    photograph: Photograph | None = None  # its photograph
 
 
 @dataclass(frozen=True)
@@ -493,6 +504,7 @@ class Transient:
     gizmo: Gizmo | Decal | Pull | None = None
     measure: Measure | None = None  # points of the measure tool while it is active
     viewpoints: tuple[Viewpoint, ...] = ()  # training cameras in the picture
+    through: CameraView | None = None  # training camera that the view looks through
     histogram: Histogram | None = None  # histogram over the picture
     ghosts: tuple[DecalGhost | PreviewGhost, ...] = ()  # edits in training that have no layer yet
     pointer: KeyPointer = KeyPointer()  # pointer of the active tool
@@ -508,6 +520,11 @@ class Transient:
     def has_bar(self) -> bool:
         """True if what is moved, pulled or placed has its own bar above the picture."""
         return self.gizmo.placed if isinstance(self.gizmo, Decal) else self.gizmo is not None
+
+    @property
+    def held_pull(self) -> Pull | None:
+        """Pull whose handle is moved, or whose cut is drawn; None for none."""
+        return self.gizmo if isinstance(self.gizmo, Pull) and self.gizmo.is_held else None
 
     @property
     def covers(self) -> tuple[Cover, ...]:

@@ -29,7 +29,7 @@ MAX_PAINTED = 16
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
-AGAINST = ("original", "snapshots")
+AGAINST = ("original", "snapshots", "photograph")
 MAX_AMPLIFIED = 64.0  # largest factor of a difference view
 MAX_FRAME = 9999  # largest last frame of a timeline
 MAX_FPS = 120  # largest frame rate of a timeline, frames per second
@@ -136,7 +136,8 @@ class Comparison:
     divider: Share = 0.5  # start of the edited side of a split, share of the picture's width
     # factor of a difference view, 1 to `MAX_AMPLIFIED`
     amplify: Annotated[float, Meta(ge=1.0, le=MAX_AMPLIFIED)] = 4.0
-    # "original", or "snapshots": A of `ViewState.pair` against B, independent of the sliders
+    # "original"; "snapshots": A of `ViewState.pair` against B, independent of the sliders; or "photograph" of
+    # the training camera that the view looks through
     against: Annotated[str, one_of(AGAINST)] = "original"
 
 

@@ -1,8 +1,13 @@
-"""Training cameras in the picture: a frustum per camera with its photograph. A click looks through it."""
+"""Training cameras in the picture: a frustum per camera with its photograph.
+
+A click looks through a camera and compares the splats with its photograph until the view changes.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,11 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
-from viewer.camera.view_camera import Bounds, Vec3, ViewCamera, from_camera
+from progdf.errors import ProgdfError
+from viewer.camera.photograph import Photograph, load_photograph
+from viewer.camera.view_camera import Bounds, Vec3, ViewCamera, axes, from_camera
+from viewer.pictures.compare import PHOTOGRAPH
 from viewer.pictures.film import Pixels
-from viewer.state import workspace
-from viewer.state.transient import Viewpoint
-from viewer.state.workspace import Workspace
+from viewer.state import history, workspace
+from viewer.state.transient import CameraView, Viewpoint
+from viewer.state.view_state import Comparison, ViewState
+from viewer.state.workspace import Workspace, with_transient
 from viewer.ui.context import PALETTE, u32
 from viewer.ui.pointer import PointerContext
 
@@ -56,6 +65,7 @@ def _viewpoint(camera: Camera, folder: Path, base: ViewCamera, bounds: Bounds) -
         _point(world[:3, 3]),
         tuple(_point(corner) for corner in corners),
         find_photograph(camera.name, folder),
+        camera,
     )
 
 
@@ -144,11 +154,65 @@ def under(work: Workspace, pointer: PointerContext) -> Viewpoint | None:
     return min(hits, key=lambda hit: hit[0])[1] if hits else None
 
 
-def look_through(work: Workspace, viewpoint: Viewpoint) -> Workspace:
-    """Glide to a camera."""
+def look_through(work: Workspace, viewpoint: Viewpoint, pointer: PointerContext) -> Workspace:
+    """Glide to a camera, and compare with its photograph if there is one.
+
+    The lens is wide enough for the whole photograph. A photograph that cannot be read is a message.
+    """
     before = work.view.camera
-    work = workspace.with_camera(work, viewpoint.view)
+    view = _with_whole_picture(viewpoint, pointer.area.width / pointer.area.height)
+    photograph = None
+    if viewpoint.picture is not None and viewpoint.camera is not None:
+        try:
+            photograph = load_photograph(viewpoint.picture, viewpoint.camera)
+        except ProgdfError as error:
+            work = workspace.with_message(work, str(error), pointer.now, error=True)
+    work = with_transient(workspace.with_camera(work, view), through=CameraView(view, photograph))
+    if photograph is not None:
+        mode = "split" if work.view.compare.mode == "off" else work.view.compare.mode
+        work = _with_comparison(work, replace(work.view.compare, mode=mode, against=PHOTOGRAPH))
     return work if work.layout.reduced_motion else workspace.glide_from(work, before)
+
+
+def _with_whole_picture(viewpoint: Viewpoint, aspect: float) -> ViewCamera:
+    """Return the view through a camera with a lens that shows its whole picture. `aspect`: of the window"""
+    picture = axes(viewpoint.view)
+    rays = np.array(viewpoint.corners) - np.array(viewpoint.eye)
+    x, y, z = np.array([picture.right, picture.up, picture.back]) @ rays.T
+    tangent = max(np.abs(y / z).max(), np.abs(x / z).max() / aspect)
+    return replace(viewpoint.view, fov_y=min(math.degrees(2.0 * math.atan(tangent)), 179.0))
+
+
+def _with_comparison(work: Workspace, compare: Comparison) -> Workspace:
+    """Set the comparison without an undo entry, as the view through a camera is none."""
+    view = replace(work.view, compare=compare)
+    return replace(work, view=view, past=history.follow_look(work.past, work.view, view))
+
+
+def leave_camera(work: Workspace) -> Workspace:
+    """End the view through a camera and the comparison with its photograph if the view has moved on."""
+    through = work.transient.through
+    if through is not None and work.glide is None:
+        is_left = through.view != work.view.camera or not work.transient.viewpoints
+        work = with_transient(work, through=None) if is_left else work
+    if work.view.compare.against != PHOTOGRAPH or work.transient.through is not None:
+        return work
+    return _with_comparison(work, replace(work.view.compare, mode="off", against=Comparison.against))
+
+
+def compared_view(work: Workspace, view: ViewState) -> tuple[ViewState, Photograph | None]:
+    """Return the view to draw, and the photograph that it is compared with.
+
+    During the glide to a camera nothing is compared. *Original* covers the picture with the photograph.
+    """
+    through = work.transient.through
+    if view.compare.against != PHOTOGRAPH:
+        return view, None
+    if through is None or through.photograph is None or through.view != work.view.camera:
+        return replace(view, compare=Comparison()), None
+    if work.before:
+        view = replace(view, compare=replace(view.compare, mode="split", divider=1.0))
+    return view, through.photograph
 
 
 def _places(viewpoint: Viewpoint, pointer: PointerContext) -> list[tuple[float, float]] | None:
