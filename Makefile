@@ -88,6 +88,9 @@ pictures: setup extras window browser
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/python assets/figures.py
 	$(BIN)/python assets/architecture.py
+	$(BIN)/python assets/tutorials.py
+	$(BIN)/python docs/site/gallery.py build/gallery
+	$(BIN)/python assets/exhibits.py build/gallery
 
 # The site with the gallery and the reference of the Python interface; open build/site/index.html.
 site: setup extras

@@ -29,7 +29,11 @@ from tests.helpers.paths import ROOT
 from tests.helpers.scenes import ball
 from tests.helpers.sizes import PACKAGES, modules
 
-DOCUMENTS = [*PAGES, *(path for path in sorted((ROOT / "docs" / "lab").glob("*.md")) if path not in PAGES)]
+FOLDERS = ("lab", "tutorials")
+DOCUMENTS = [
+    *PAGES,
+    *(path for name in FOLDERS for path in sorted((ROOT / "docs" / name).glob("*.md")) if path not in PAGES),
+]
 OWN_BENCHMARKS = ("ablate", "sliders", "regret", "training-stages")
 """Benchmarks with options of their own."""
 

@@ -9,13 +9,19 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 
-PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "SECURITY.md": "security.md"}
+PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
+    "assets/scenes/CREDITS.md": "scenes.md",
+}
 """Page of the repository → its name in the site."""
 
 GALLERY = ROOT / "build" / "gallery"
-"""Exported pages, their pictures and the page that lists them, made by `docs/site/gallery.py`."""
+"""Exported pages, made by `docs/site/gallery.py`."""
 
 _CODE_LINK = re.compile(r"\[([^\]\[]*)\]\([^)]+\.(?:py|ipynb)\)|\[([^\]\[]*)\]\(LICENSE\)")
+_EXHIBIT = re.compile(r"!\[[^\]]*\]\(\.\./assets/exhibits/([\w-]+)\.jpg\)")
 _LINK = re.compile(r"(\]\(|src=\"|href=\")([^)\"#\s]+)")
 
 
@@ -30,15 +36,16 @@ def on_files(files: Any, config: Any) -> Any:
         if picture.suffix in (".png", ".jpg", ".webp", ".svg"):
             name = picture.relative_to(ROOT).as_posix()
             files.append(File.generated(config, name, abs_src_path=str(picture)))
-    for made in sorted(GALLERY.glob("*")):
-        name = made.name if made.suffix == ".md" else f"gallery/{made.name}"
-        files.append(File.generated(config, name, abs_src_path=str(made)))
+    for made in sorted(GALLERY.glob("*.html")):
+        files.append(File.generated(config, f"gallery/{made.name}", abs_src_path=str(made)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Lead links of the repository to pages of the site, and unlink those to code."""
+    """Lead links of the repository to pages of the site, unlink those to code, and link exhibits."""
     source = page.file.src_uri
+    if source == "gallery.md":
+        markdown = _EXHIBIT.sub(r"[\g<0>](gallery/\1.html)", markdown)
     folder = "" if source in PAGES.values() else "docs/"
     folder += source.rpartition("/")[0]
 
