@@ -250,7 +250,8 @@ def _edit_lines(path: Path) -> Iterator[str]:
 def _session_lines(path: Path) -> Iterator[str]:
     session = session_file.read_session(path, session_file.SessionFile)
     yield f"{path.name}: a session of the window, {file_size(path.stat().st_size)}"
-    references = [("scene", session.scene), *(("edit", edit) for edit in session.edits)]
+    scenes = (session.scene, *session.added)
+    references = [*(("scene", scene) for scene in scenes), *(("edit", edit) for edit in session.edits)]
     for kind, ref in references:
         file = ref.path(path.resolve().parent)
         if not os.path.isfile(file):

@@ -68,22 +68,22 @@ def write_bundle(path: Path, source: Path) -> int:
         The number of files in the bundle.
 
     Raises:
-        ProgdfError: see `verify_files`, or the scene has several files, such as an unpacked .sog or a .gltf.
+        ProgdfError: see `verify_files`, or a scene has several files, such as an unpacked .sog or a .gltf.
     """
     session = read_session(source, SessionFile)
-    scene, edits = verify_files(source, session)
-    if scene.name.lower() in ("meta.json", "lod-meta.json"):
-        raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
-    if scene.suffix.lower() == ".gltf":
-        raise ProgdfError(f"{scene} keeps numbers in other files; export the scene as a .glb first")
-    if len(part_files(scene)) > 1:
-        raise ProgdfError(f"{scene} is one of several parts of a scene; export the scene as a .ply first")
-    names = _member_names((scene, *edits))
+    scenes, edits = verify_files(source, session)
+    for scene in scenes:
+        _check_bundled(scene)
+    names = _member_names((*scenes, *edits))
     for region in session.view.get("selection", {}).get("regions", ()):
         region["path"] = PureWindowsPath(region["path"]).name
     placed = msgspec.structs.replace(
         session,
-        scene=msgspec.structs.replace(session.scene, file=names[scene]),
+        scene=msgspec.structs.replace(session.scene, file=names[scenes[0]]),
+        added=tuple(
+            msgspec.structs.replace(ref, file=names[file])
+            for ref, file in zip(session.added, scenes[1:], strict=True)
+        ),
         edits=tuple(
             msgspec.structs.replace(ref, file=names[file])
             for ref, file in zip(session.edits, edits, strict=True)
@@ -97,6 +97,16 @@ def write_bundle(path: Path, source: Path) -> int:
             for file, name in {inner: inner.name, **names}.items():
                 archive.write(file, name)
     return 1 + len(names)
+
+
+def _check_bundled(scene: Path) -> None:
+    """Raise ProgdfError if a scene consists of several files."""
+    if scene.name.lower() in ("meta.json", "lod-meta.json"):
+        raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
+    if scene.suffix.lower() == ".gltf":
+        raise ProgdfError(f"{scene} keeps numbers in other files; export the scene as a .glb first")
+    if len(part_files(scene)) > 1:
+        raise ProgdfError(f"{scene} is one of several parts of a scene; export the scene as a .ply first")
 
 
 def _member_names(files: Sequence[Path]) -> dict[Path, str]:

@@ -56,6 +56,7 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class EditRef(FileRef, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Reference to an edit that a session needs."""
 
+    scene: int = 0  # index of its scene: 0 is `SessionFile.scene`, then `SessionFile.added`
     region: str = ""  # name of the region that its grade is applied to
     members: bytes = b""  # Gaussians of that region, stored like a selection; empty: the edit's own
 
@@ -67,6 +68,7 @@ class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     edits: tuple[EditRef, ...] = ()  # the .gdf files, in the order of the layers' indices
     view: dict[str, Any] = {}  # state of the window
     snapshots: tuple[dict[str, Any], ...] = ()  # saved states
+    added: tuple[FileRef, ...] = ()  # further scenes of the view
 
 
 File = TypeVar("File", bound=SessionFile)
@@ -111,7 +113,10 @@ def write_session(path: Path, session: SessionFile) -> None:
     Raises:
         ProgdfError: the folder does not exist.
     """
-    text = json.dumps({MARK: VERSION} | to_json(session), indent=2, ensure_ascii=False, allow_nan=False)
+    table = to_json(session)
+    if not session.added:  # most sessions have one scene
+        del table["added"]
+    text = json.dumps({MARK: VERSION} | table, indent=2, ensure_ascii=False, allow_nan=False)
     # put lists of numbers on one line; JSON strings contain no line breaks, so the pattern matches none
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     atomic.write_file(path, text + "\n")
@@ -161,19 +166,20 @@ def _add_texture_gains(value: object) -> None:
             _add_texture_gains(item)
 
 
-def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ...]]:
-    """Find the scene and the edits of the session at `path`, and verify that they have not changed.
+def verify_files(path: Path, session: SessionFile) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Find the scenes and the edits of the session at `path`, and verify that they have not changed.
 
     A file that is missing at its path, as on another computer, is looked up beside the session.
 
     Returns:
-        The scene's file and the edits' files.
+        The files of the scenes, the first one first, and those of the edits.
 
     Raises:
         ProgdfError: a file is missing or has changed.
     """
     files = []
-    for ref in (session.scene, *session.edits):
+    scenes = (session.scene, *session.added)
+    for ref in (*scenes, *session.edits):
         folder = path.resolve().parent
         file = ref.path(folder)
         beside = folder / PureWindowsPath(ref.file).name
@@ -189,7 +195,7 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
                 "put the original file back or save a new session"
             )
         files.append(file)
-    return files[0], tuple(files[1:])
+    return tuple(files[: len(scenes)]), tuple(files[len(scenes) :])
 
 
 def sha256(path: Path) -> str:

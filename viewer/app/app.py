@@ -285,7 +285,7 @@ class App:
             self._title = title
 
     def _engine(self, document: Document, live: tuple[Gdf, ...] = ()) -> ViewEngine:
-        shown = replace(document, edits=(*document.edits, *live)) if live else document
+        shown = replace(document, live=live) if live else document
         return ViewEngine(self.context, shown.scene, shown.gdfs, self._draw)
 
     def _quit(self) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import torch
+from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.compose.added import extend
@@ -25,8 +26,11 @@ from progdf.terminal import escape_text
 from progdf.threads import all_threads
 from viewer.camera.view_camera import Bounds, SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
 from viewer.state.facts import layer_rows
-from viewer.state.view_state import LayerState
+from viewer.state.view_state import LayerState, SceneState
 from viewer.state.workspace import SceneFacts
+
+from . import scenes
+from .scenes import SceneFile
 
 _Value = TypeVar("_Value")
 
@@ -43,17 +47,121 @@ def _own_region(_: Gaussians, index: int, name: str) -> Region | None:
 
 @dataclass(frozen=True)
 class Document:
-    """Scene and its edits, indexed by `LayerState.gdf`."""
+    """Scene and its edits, indexed by `LayerState.gdf`; or several scenes, merged (see `scenes`)."""
 
     title: str  # name of the scene; "" if none is open
-    original: Gaussians  # scene as in its file
-    edits: tuple[Gdf, ...] = ()  # edits of the original, as in their files
-    path: Path | None = None  # file of the scene; without one, no session can be saved
+    original: Gaussians  # scene as in its file, or the merged scenes
+    edits: tuple[Gdf, ...] = ()  # edits as in their files, each of its own scene
+    path: Path | None = None  # file of the first scene; without one, no session can be saved
     gdf_paths: tuple[Path, ...] = ()  # files of the edits, either none or one per edit
+    files: tuple[
+        SceneFile, ...
+    ] = ()  # all scenes that were opened, indexed by `SceneState.scene`; empty: one
+    states: tuple[SceneState, ...] = ()  # scenes of the view from which `original` was merged
+    owners: tuple[int, ...] = ()  # scene of each edit; missing ones: the first scene
+    live: tuple[Gdf, ...] = ()  # edits of `original` in training or preview, after the others
+
+    @cached_property
+    def placed(self) -> tuple[Gdf, ...]:
+        """Edits as edits of `original`."""
+        return tuple(self.place(gdf, self.owner(i)) for i, gdf in enumerate(self.edits))
 
     @cached_property
     def _extension(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
-        return extend(self.original, self.edits)
+        scene, gdfs = extend(self.original, (*self.placed, *self.live))
+        hidden = [
+            gdf for i, gdf in enumerate(gdfs[: len(self.edits)]) if not self._state(self.owner(i)).visible
+        ]
+        rows = [gdf.region.members[gdf.region.members >= len(self.original)] for gdf in hidden]
+        if any(map(len, rows)):
+            logits = scene.logit_opacities.index_fill(0, torch.cat(rows), scenes.HIDDEN_LOGIT)
+            scene = replace(scene, logit_opacities=logits)
+        return scene, gdfs
+
+    def _state(self, scene: int) -> SceneState:
+        return scenes.state_of(self.states, scene)
+
+    @property
+    def opened(self) -> tuple[SceneFile, ...]:
+        """All scenes that were opened."""
+        return self.files or (SceneFile(self.title, self.original, self.path),)
+
+    def owner(self, edit: int) -> int:
+        """Return the scene of an edit."""
+        return self.owners[edit] if edit < len(self.owners) else 0
+
+    def place(self, gdf: Gdf, scene: int) -> Gdf:
+        """Return an edit of a scene as an edit of `original`."""
+        if not self.files:
+            return gdf
+        return scenes.placed_edit(gdf, self.files, scene, self._state(scene).placement, self.original)
+
+    def own(self, gdf: Gdf) -> tuple[Gdf, int]:
+        """Return an edit of `original` as an edit of its scene, and that scene.
+
+        Raises:
+            ProgdfError: it changes several scenes.
+        """
+        if not self.files:
+            return gdf, 0
+        scene = self.scene_with(gdf.region.members)
+        return scenes.own_edit(gdf, self.files, scene, self._state(scene).placement), scene
+
+    def scene_with(self, rows: Tensor) -> int:
+        """Return the scene that holds some rows of `original`; without rows, the only visible scene.
+
+        Raises:
+            ProgdfError: there are several.
+        """
+        if not self.files:
+            return 0
+        found = [state.scene for state in self.states if state.visible]
+        if len(rows):
+            bounds = [scenes.rows_of(self.files, i) for i in range(len(self.files))]
+            found = [
+                i for i, own in enumerate(bounds) if bool(((rows >= own.start) & (rows < own.stop)).any())
+            ]
+        if len(found) != 1:
+            raise ProgdfError(
+                "an edit belongs to one scene; select Gaussians of one scene, or hide the other scenes"
+            )
+        return found[0]
+
+    def with_scenes(self, *added: SceneFile) -> Document:
+        """Return the document with further scenes, which stay hidden until a view lists them."""
+        if not added:
+            return self
+        states = self.states or scenes.first_states(self.title)
+        return replace(self, files=(*self.opened, *added), states=states)._merged()
+
+    def arranged(self, states: tuple[SceneState, ...]) -> Document:
+        """Return the document with the scenes as a view lists them; the same object if nothing changes."""
+        if states == self.states:
+            return self
+        if not self.files:
+            return replace(self, files=self.opened).arranged(states)
+        is_same = [(s.scene, s.visible, s.placement) for s in states] == [
+            (s.scene, s.visible, s.placement) for s in self.states
+        ]
+        first = self.files[states[0].scene if states else 0]
+        changed = replace(self, states=states, title=first.title, path=first.path)
+        return changed if is_same else changed._merged()
+
+    def _merged(self) -> Document:
+        return replace(self, original=scenes.merge(self.files, self.states))
+
+    @property
+    def shown(self) -> Gaussians:
+        """Original without the rows of hidden scenes."""
+        hidden = self.hidden
+        return self.original if not bool(hidden.any()) else self.original[~hidden]
+
+    @property
+    def hidden(self) -> Tensor:
+        """Rows of the original that belong to hidden scenes. [N] bool"""
+        if not self.files:
+            return torch.zeros(len(self.original), dtype=torch.bool)
+        return scenes.hidden_rows(self.files, self.states)
 
     @property
     def scene(self) -> Gaussians:
@@ -67,13 +175,14 @@ class Document:
 
     @cached_property
     def detected_up(self) -> SceneUp:
-        """Up axis found from the scene and its edits."""
-        return find_scene_up(self.original, self.edits, path=self.path)
+        """Up axis found from the first scene and its edits."""
+        edits = [gdf for i, gdf in enumerate(self.edits) if self.owner(i) == 0]
+        return find_scene_up(self.opened[0].gaussians, edits, path=self.path)
 
     @cached_property
     def bounds(self) -> Bounds:
-        """Bounds of the bulk of the original."""
-        return bounds_of(self.original)
+        """Bounds of the bulk of the visible scenes."""
+        return bounds_of(self.shown)
 
     @cached_property
     def stored_camera(self) -> Camera | None:
@@ -83,7 +192,8 @@ class Document:
     def facts(self) -> SceneFacts:
         """Compute the facts for the panel and the camera."""
         scene = self.scene
-        added = [gdf.members - len(gdf.region) for gdf in self.edits]
+        added = [gdf.members - len(gdf.region) for gdf in (*self.edits, *self.live)]
+        shown = self.shown
         neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
             title=self.title,
@@ -91,13 +201,14 @@ class Document:
             added=len(scene) - len(self.original),
             bounds=self.bounds,
             origin=scene.origin,
+            scene_counts=tuple(len(file.gaussians) for file in self.files),
             rows=layer_rows(scene, self.gdfs, added),
-            fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
+            fit=lambda camera, aspect: fit_all(camera, shown, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
             neighborhood=neighborhood,
             scribbles=_once(lambda: neighborhood().scribbles),
             home=lambda camera, aspect: replace(
-                first_camera(self.original, (), aspect, camera.fov_y, camera.up, stored=self.stored_camera),
+                first_camera(shown, (), aspect, camera.fov_y, camera.up, stored=self.stored_camera),
                 mode=camera.mode,
             ),
         )
@@ -180,39 +291,65 @@ def empty() -> Document:
     return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, no_sh))
 
 
-def load(scene: Path, gdfs: Sequence[Path] = (), place: RegionChooser = _own_region) -> Document:
-    """Load a scene and its edits.
+def load(
+    scene: Path,
+    gdfs: Sequence[Path] = (),
+    place: RegionChooser = _own_region,
+    added: Sequence[Path] = (),
+    owners: Sequence[int] = (),
+) -> Document:
+    """Load a scene and its edits, or several scenes with theirs.
 
     Args:
         scene: file or folder of the scene
-        gdfs: files of its edits
+        gdfs: files of the edits
         place: chooses the region of each edit's grade
+        added: files of further scenes, which stay hidden until the document is `arranged`
+        owners: scene of each edit, in the order of the scenes; missing ones: the first scene
 
     Raises:
         ProgdfError: a file is missing or damaged, or an edit was made for another scene.
     """
     scene = scene_file(scene)
     gaussians = load_scene(scene)
-    edits = load_edits(gdfs, gaussians, scene, place)
-    return Document(escape_text(scene_name(scene)), gaussians, edits, scene, tuple(gdfs))
+    first = SceneFile(escape_text(scene_name(scene)), gaussians, scene)
+    opened = (first, *map(load_file, added))
+    edits = load_edits(gdfs, opened, place, owners)
+    document = Document(first.title, gaussians, edits, scene, tuple(gdfs), owners=tuple(owners))
+    return document.with_scenes(*opened[1:])
+
+
+def load_file(path: Path) -> SceneFile:
+    """Load a scene to add to a view.
+
+    Raises:
+        ProgdfError: the file is missing or damaged.
+    """
+    path = scene_file(path)
+    return SceneFile(escape_text(scene_name(path)), load_scene(path), path)
 
 
 def load_edits(
-    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: RegionChooser = _own_region
+    paths: Sequence[Path],
+    opened: Sequence[SceneFile],
+    place: RegionChooser = _own_region,
+    owners: Sequence[int] = (),
 ) -> tuple[Gdf, ...]:
-    """Load the edits of a scene. A second edit of the same name becomes NAME-2, so that --set is unambiguous.
+    """Load the edits of scenes. A second edit of the same name becomes NAME-2, so that --set is unambiguous.
 
     Raises:
         ProgdfError: a file is missing, damaged, or was made for another scene.
     """
     gdfs: list[Gdf] = []
     for index, path in enumerate(paths):
+        owner = opened[owners[index] if index < len(owners) else 0]
 
-        def region(stored: Gdf, index: int = index) -> Region | None:
+        def region(stored: Gdf, index: int = index, scene: Gaussians = owner.gaussians) -> Region | None:
             return place(scene, index, _free_name(stored.name, gdfs))
 
+        name = owner.title if owner.path is None else owner.path.name
         with all_threads():
-            gdf = load_gdf(path, scene, scene_path.name, region)
+            gdf = load_gdf(path, owner.gaussians, name, region)
         gdfs.append(replace(gdf, name=_free_name(gdf.name, gdfs)))
     return tuple(gdfs)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import torch
+
 from progdf.compose.added import remaining_rows
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, lattice_colors, lattice_side
@@ -25,9 +27,17 @@ from viewer.state.view_state import ViewState
 
 
 def compose(document: Document, view: ViewState, share: float = 1.0, whole: bool = False) -> Gaussians:
-    """Return the scene at a share of the strengths, without rows that draw nothing, unless `whole`."""
+    """Return the visible scenes at a share of the strengths.
+
+    Rows that draw nothing are left out, unless `whole`.
+    """
     edited = compose_view(document.scene, document.gdfs, view, share)
-    return edited if whole else edited[remaining_rows(document.original, edited)]
+    rows = torch.arange(len(edited)) if whole else remaining_rows(document.original, edited)
+    hidden = torch.zeros(len(edited), dtype=torch.bool)
+    hidden[: len(document.original)] = document.hidden
+    if bool(hidden.any()):
+        rows = rows[~hidden[rows]]
+    return edited if len(rows) == len(edited) else edited[rows]
 
 
 def describe_loss(out: Path, edited: Gaussians, read_back: ReadBack | None) -> str:

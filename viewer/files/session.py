@@ -24,6 +24,7 @@ from progdf.compose import layer_paint
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.placed import Placement
 from progdf.io.atomic import (
     LockedError,
     hold_lock,
@@ -48,11 +49,12 @@ from progdf.region import Region, from_mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
 from viewer.state import selection
+from viewer.state.layers import tidy_groups
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.timeline import split_keys
 from viewer.state.view_state import LayerState, Timeline, ViewState
 
-from . import document, region_files
+from . import document, region_files, scenes
 from .document import Document
 
 _log = logging.getLogger(__name__)
@@ -92,6 +94,14 @@ class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
                     raise ValueError(
                         f"{where}.layers[{i}].gdf is {layer.gdf}, but there are {len(self.edits)} edits"
                     )
+        listed = [state.scene for state in self.view.scenes] or [0]
+        if sorted(listed) != list(range(1 + len(self.added))):
+            raise ValueError(f"view.scenes lists {listed}, but there are {1 + len(self.added)} scenes")
+        for i, edit in enumerate(self.edits):
+            if not 0 <= edit.scene <= len(self.added):
+                raise ValueError(
+                    f"edits[{i}].scene is {edit.scene}, but there are {1 + len(self.added)} scenes"
+                )
 
 
 def save(path: Path, session: WindowSession) -> None:
@@ -102,8 +112,9 @@ def save(path: Path, session: WindowSession) -> None:
     """
     if session.document.path is None or len(session.document.gdf_paths) != len(session.document.edits):
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
-    scene = session.document.path
     session = prune(session)
+    scene = session.document.path
+    assert scene is not None
     view, snapshots = _move(session.view, session.snapshots, session.document.scene.origin)
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
@@ -111,18 +122,20 @@ def save(path: Path, session: WindowSession) -> None:
     view = _with_region_paths(view, lambda region: Path(relative_name(region, folder)))
     opened = session.document
     edits = tuple(
-        _edit_ref(gdf, path, folder) for gdf, path in zip(opened.edits, opened.gdf_paths, strict=True)
+        _edit_ref(gdf, path, folder, opened.owner(i))
+        for i, (gdf, path) in enumerate(zip(opened.edits, opened.gdf_paths, strict=True))
     )
-    write_session(path, WindowFile(reference(scene, folder), edits, view, snapshots))
+    added = tuple(reference(file.path, folder) for file in opened.files[1:] if file.path is not None)
+    write_session(path, WindowFile(reference(scene, folder), edits, view, snapshots, added))
 
 
-def _edit_ref(gdf: Gdf, path: Path, folder: Path) -> EditRef:
+def _edit_ref(gdf: Gdf, path: Path, folder: Path, scene: int) -> EditRef:
     file = reference(path, folder)
     if not gdf.applied:
-        return EditRef(file.file, file.sha256)
+        return EditRef(file.file, file.sha256, scene)
     mask = np.zeros(gdf.scene.count, bool)
     mask[gdf.region.members.numpy()] = True
-    return EditRef(file.file, file.sha256, gdf.region.name, selection.pack(mask))
+    return EditRef(file.file, file.sha256, scene, gdf.region.name, selection.pack(mask))
 
 
 def open_session(path: Path) -> WindowSession:
@@ -133,7 +146,8 @@ def open_session(path: Path) -> WindowSession:
             missing, damaged or not the one it was saved with.
     """
     file = read_session(path, WindowFile)
-    scene, gdfs = verify_files(path, file)
+    files, gdfs = verify_files(path, file)
+    owners = tuple(edit.scene for edit in file.edits)
 
     def place(scene: Gaussians, index: int, name: str) -> Region | None:
         edit = file.edits[index]
@@ -141,7 +155,7 @@ def open_session(path: Path) -> WindowSession:
             return None
         return from_mask(edit.region, torch.from_numpy(selection.unpack(edit.members, len(scene)).copy()))
 
-    opened = document.load(scene, gdfs, place)
+    opened = document.load(files[0], gdfs, place, files[1:], owners).arranged(file.view.scenes)
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     selection.check(view.selection, len(opened.scene))
@@ -153,7 +167,7 @@ def open_session(path: Path) -> WindowSession:
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         gdf = opened.gdfs[layer.gdf]
         layer_paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises if the weights do not fit
-    claimed = region_files.claim_regions(view.selection, region_files.region_folders(path, scene))
+    claimed = region_files.claim_regions(view.selection, region_files.region_folders(path, files[0]))
     moved = [
         f"{old.name:.60} ({str(old.path)[:80]})"
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)
@@ -228,6 +242,11 @@ def default_path(opened: Document) -> Path:
 
 
 def prune(session: WindowSession) -> WindowSession:
+    """Remove the edits that no layer of the view or of a snapshot uses, and unlisted scenes."""
+    return _drop_scenes(_drop_edits(_without_layers(session)))
+
+
+def _drop_edits(session: WindowSession) -> WindowSession:
     """Remove the edits that no layer of the view or of a snapshot uses."""
     view = session.view
     snapshots = session.snapshots
@@ -266,6 +285,7 @@ def prune(session: WindowSession) -> WindowSession:
             opened,
             edits=tuple(opened.edits[gdf] for gdf in used),
             gdf_paths=tuple(opened.gdf_paths[gdf] for gdf in used),
+            owners=tuple(opened.owner(gdf) for gdf in used) if opened.owners else (),
         ),
         replace(
             view,
@@ -274,6 +294,61 @@ def prune(session: WindowSession) -> WindowSession:
             unfolded=tuple(new_index[gdf] for gdf in view.unfolded if gdf in new_index),
         ),
         tuple(replace(s, edit=replace(s.edit, layers=renumber(s.edit.layers))) for s in snapshots),
+    )
+
+
+def visible_only(session: WindowSession) -> WindowSession:
+    """Return the session without hidden scenes and their layers.
+
+    Raises:
+        ProgdfError: all scenes are hidden.
+    """
+    shown = tuple(state for state in session.view.scenes if state.visible)
+    if shown == session.view.scenes:
+        return session
+    if not shown:
+        raise ProgdfError("all scenes are hidden; show one first")
+    return prune(replace(session, view=replace(session.view, scenes=shown)))
+
+
+def _without_layers(session: WindowSession) -> WindowSession:
+    """Remove the layers of scenes that the view does not list."""
+    opened = session.document
+    listed = {state.scene for state in session.view.scenes} or {0}
+    if len(listed) == len(opened.opened):
+        return session
+
+    def keep(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
+        return tuple(layer for layer in layers if opened.owner(layer.gdf) in listed)
+
+    view = tidy_groups(replace(session.view, layers=keep(session.view.layers)))
+    snapshots = tuple(replace(s, edit=replace(s.edit, layers=keep(s.edit.layers))) for s in session.snapshots)
+    return replace(session, view=view, snapshots=snapshots)
+
+
+def _drop_scenes(session: WindowSession) -> WindowSession:
+    """Remove the scenes that the view does not list, and number the others again."""
+    opened = session.document
+    states = session.view.scenes or scenes.first_states(opened.opened[0].title)
+    kept = sorted(state.scene for state in states)
+    if len(kept) == len(opened.opened):
+        return session
+    stays = np.ones(len(opened.scene), bool)
+    for scene in range(len(opened.files)):
+        stays[scenes.rows_of(opened.files, scene)] = scene in kept
+    masks = selection.take_rows(session.view.selection, len(opened.scene), np.flatnonzero(stays))
+    states = tuple(replace(state, scene=kept.index(state.scene)) for state in states)
+    first, *others = (opened.files[scene] for scene in kept)
+    if not others and states[0].visible and states[0].placement == Placement():
+        states = ()
+    remaining = Document(first.title, first.gaussians, opened.edits, first.path, opened.gdf_paths)
+    remaining = replace(
+        remaining, owners=tuple(kept.index(opened.owner(i)) for i in range(len(opened.edits)))
+    )
+    return replace(
+        session,
+        document=remaining.with_scenes(*others).arranged(states),
+        view=replace(session.view, scenes=states, selection=masks),
     )
 
 

@@ -25,7 +25,9 @@ from viewer.state.view_state import LayerState, Timeline, ViewState
 from viewer.web.container import DRAWN_SH, pack
 from viewer.web.page import HOST, MAIL_LIMIT_BYTES, PageTexts, build_page
 
+from . import session
 from .document import Document
+from .session import WindowSession
 
 PAGE = ".html"  # suffix of a page
 STILL = 1200, 800
@@ -71,6 +73,10 @@ def write_page(
     Raises:
         ProgdfError: an option names an unknown layer, or the page cannot be written.
     """
+    shown = session.visible_only(WindowSession(document, view, tuple(kept)))
+    document = shown.document
+    view = shown.view
+    kept = shown.snapshots
     stage, edits = first_state(document, view, kept, options)
     gdfs = [document.gdfs[i] for i in edits]
     title = options.title or Path(document.title).stem

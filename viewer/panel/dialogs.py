@@ -32,6 +32,7 @@ _LOG_CHARACTERS = 20_000
 TITLES = {
     "save": "Save session",
     "open": "Open",
+    "add_scene": "Add a scene to this view",
     "replace": "Replace the layer's edit",
     "rebind": "Rebind an edit of another scene",
     "leave": "Unsaved changes",
@@ -52,6 +53,7 @@ TITLES = {
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
     "open": "A scene (.ply, .spz, .sog …), an edit (.gdf, .cube), an edited picture, a session or cameras.",
+    "add_scene": "A scene (.ply, .spz, .sog …). It appears at the coordinates of its file.",
     "replace": "An edit (.gdf, .cube). The layer keeps its position, strength and gains.",
     "rebind": "The scene of this edit: the open scene in another file or format.",
     "leave": "Save changes to {}?",
@@ -72,6 +74,7 @@ _HINTS = {
 _SUBMIT = {
     "save": "Save",
     "open": "Open",
+    "add_scene": "Add",
     "replace": "Replace",
     "rebind": "Rebind",
     "export": "Export",
@@ -80,7 +83,7 @@ _SUBMIT = {
     "render_film": "Render",
 }
 """Button of each dialog that has a path field."""
-_OPENS = ("open", "replace", "rebind")
+_OPENS = ("open", "add_scene", "replace", "rebind")
 _STAYS_OPEN = imgui.SelectableFlags_.no_auto_close_popups.value
 _PATH_ROWS = 6  # visible rows of the list of files
 _DELIVERS = ("export", "export_page", "render_picture", "render_film")
@@ -255,7 +258,7 @@ def _is_new(kind: str) -> bool:
 
 def _submit(dialog: Dialog, path: str) -> DialogResult:
     """Request the file; the dialog stays open if the file may be rejected."""
-    kept = dialog.kind in ("save", "open", *_DELIVERS)
+    kept = dialog.kind in ("save", "open", "add_scene", *_DELIVERS)
     error = dialog.error if dialog.kind in _DELIVERS else ""  # a second press confirms an existing file
     stays = replace(dialog, text=path, chosen="", error=error) if kept else None
     return DialogResult(stays, (_submission(dialog, path),))
@@ -268,6 +271,8 @@ def _submission(dialog: Dialog, path: str) -> Action:
             return WithText("save_to", path)
         case "open":
             return WithText("open_file", path)
+        case "add_scene":
+            return WithText("add_file", path)
         case "replace":
             return ReplaceEdit(dialog.item, path)
         case "rebind":

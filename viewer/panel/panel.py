@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 from imgui_bundle import imgui, imgui_ctx
 
+from progdf.gdf.placed import Placement
 from progdf.terminal import escape_text
 from viewer.state import history
 from viewer.state.commands import Action, OnItem, Plain, Rename, SelectRegion, WithText
 from viewer.state.layer_selection import selected_layers
 from viewer.state.selection import NamedRegion
+from viewer.state.view_state import SceneState
 from viewer.state.workspace import REGIONS_OF_EDITS, UNSAVED, Layout, SceneFacts, Workspace, has_unsaved
 from viewer.ui import widgets
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -39,7 +41,7 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
         )
         for path in recent[:_MAX_RECENT]
     ]
-    widgets.more_button(MENU_ID, ("open", *files, *_MENU_ACTIONS), ui, actions, Icon.BARS, side)
+    widgets.more_button(MENU_ID, ("open", "add_scene", *files, *_MENU_ACTIONS), ui, actions, Icon.BARS, side)
     widgets.tip("Menu")
 
 
@@ -95,9 +97,13 @@ def draw(
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
     if len(work.view.layers) > cards.SEARCH_THRESHOLD:
         room -= imgui.get_frame_height_with_spacing()
+    if work.view.scenes:
+        lines = 1 if SCENES in work.layout.folded else 1 + len(work.view.scenes)
+        room -= lines * imgui.get_frame_height_with_spacing()
     work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)
     _begin_body(footer + cards.selection_height(selected, ui), ui)
+    work = _scenes(work, facts, ui, actions)
     work = cards.draw_heading(work, ui, actions)
     work = new_edit_form.draw(work, facts.count, ui, actions)
     work = cards.draw(work, facts.rows, pictures.edits, reveal, ui, actions)
@@ -177,6 +183,77 @@ def _title(work: Workspace, facts: SceneFacts, ui: UiContext, actions: list[Acti
     _menu_button(work.transient.recent, side, ui, actions)
     imgui.set_cursor_pos(below)
     imgui.dummy((0.0, 2.0 * scale))
+
+
+SCENES = "Scenes"
+"""Section of the panel with the scenes of a view that has several."""
+_SCENE_MENU = "menu of a scene"
+
+
+def _scene_menu(index: int, is_placed: bool) -> tuple[tuple[str, Action | None, str], ...]:
+    place_back = (("Back to its own place", OnItem("reset_scene", index), ""),) if is_placed else ()
+    return (
+        ("Select", OnItem("select_scene", index), ""),
+        ("Move…", OnItem("move_scene", index), "Move, rotate and scale it"),
+        *place_back,
+        ("Rename…", None, ""),
+        ("Remove", OnItem("remove_scene", index), "With its layers; its file stays"),
+    )
+
+
+def _scenes(work: Workspace, facts: SceneFacts, ui: UiContext, actions: list[Action]) -> Workspace:
+    """Draw the scenes of a view that has several."""
+    if not work.view.scenes:
+        return work
+    work = replace(work, layout=widgets.section(SCENES, work.layout, ui))
+    if SCENES in work.layout.folded:
+        return work
+    for i, state in enumerate(work.view.scenes):
+        count = facts.scene_counts[state.scene] if state.scene < len(facts.scene_counts) else 0
+        with imgui_ctx.push_id(f"scene {i}"):
+            icon = Icon.SHOWN if state.visible else Icon.HIDDEN
+            if widgets.icon_button("eye", icon, ui, dim=not state.visible):
+                actions.append(OnItem("show_scene", i))
+            widgets.tip("Hide this scene" if state.visible else "Show this scene")
+            imgui.same_line()
+            wide = 8.0 * ui.scale
+            right = widgets.right_edge()
+            room = right - imgui.get_cursor_pos_x() - wide
+            if widgets.name_field(state.name, room, partial(Rename, "rename_scene", i), actions):
+                continue
+            _scene_name(i, state, widgets.group_digits(count), right, ui, actions)
+    return work
+
+
+def _scene_name(
+    index: int, state: SceneState, count: str, right: float, ui: UiContext, actions: list[Action]
+) -> None:
+    """Draw the name and the count of a scene: a click selects it, a double click moves it."""
+    scale = ui.scale
+    x, y = imgui.get_cursor_screen_pos()
+    size = (max(right - imgui.get_cursor_pos_x(), 1.0), imgui.get_frame_height())
+    with imgui_ctx.push_font(None, SMALL_PX):
+        wide = imgui.calc_text_size(count).x
+    if imgui.invisible_button("select", size, imgui.ButtonFlags_.enable_nav.value):
+        actions.append(OnItem("select_scene", index))
+    if widgets.is_double_clicked():
+        actions.append(OnItem("move_scene", index))
+    is_hovered = imgui.is_item_hovered()
+    widgets.tip(f"{state.name}\nClick to select, double click to move. Right-click: rename, remove")
+    if imgui.is_item_clicked(imgui.MouseButton_.right.value):
+        imgui.open_popup(_SCENE_MENU)
+    above = imgui.get_style().frame_padding.y
+    canvas = imgui.get_window_draw_list()
+    color = u32(PALETTE.text if state.visible else PALETTE.dim)
+    canvas.add_text((x, y + above), color, widgets.elide(state.name, size[0] - wide - 10.0 * scale))
+    at = (imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
+    dim = u32(PALETTE.text if is_hovered else PALETTE.dim)
+    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, dim, count)
+    menu = _scene_menu(index, state.placement != Placement())
+    for action in widgets.menu_items(_SCENE_MENU, menu, ui):
+        widgets.start_naming(action is None)
+        if action is not None:
+            actions.append(action)
 
 
 _REGION_MENU = "menu of a region"

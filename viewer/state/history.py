@@ -19,6 +19,7 @@ from .view_state import (
     LayerGroup,
     LayerState,
     PaintedPicture,
+    SceneState,
     SnapshotPair,
     Timeline,
     ViewState,
@@ -39,6 +40,7 @@ class Edit:
     groups: tuple[LayerGroup, ...] = ()
     pair: SnapshotPair = SnapshotPair()
     painted: tuple[PaintedPicture, ...] = ()
+    scenes: tuple[SceneState, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -228,6 +230,7 @@ _EDIT_LABELS = {
     "overshoot": "overshoot",
     "pair": "snapshot pair",
     "painted": "painting",
+    "scenes": "scenes",
 }
 _VIEW_LABELS = {
     "background": "background",

@@ -77,7 +77,7 @@ def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     """Restore a snapshot in `view`. Edits opened since then stay in the stack at strength 0.
 
-    The camera, the timeline, the selection and unfinished paint are unchanged.
+    The camera, the timeline, the selection, the scenes and unfinished paint are unchanged.
     """
     known = {layer.gdf for layer in snapshot.edit.layers}
     later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in known)
@@ -88,6 +88,7 @@ def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
         timeline=view.timeline,
         selection=view.selection,
         painted=view.painted,
+        scenes=view.scenes,
     )
 
 
@@ -116,10 +117,11 @@ def choose(view: ViewState, slot: str, name: str) -> ViewState:
 
 
 def _snapshot_edit(view: ViewState) -> history.Edit:
-    """Return the edit that a snapshot stores: all but the timeline, the selection, the compared pair and
-    unfinished paint."""
+    """Return the edit that a snapshot stores: the layers with their groups and blend rule."""
     edit = history.edit_of(view)
-    return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair(), painted=())
+    return replace(
+        edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair(), painted=(), scenes=()
+    )
 
 
 def _next_name(snapshots: Sequence[SliderSnapshot]) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar
 from msgspec import Meta
 
 from progdf.compose.layers import BLENDS, DEFAULT_BLEND, Gains
+from progdf.gdf.placed import Placement
 from progdf.io.json_values import one_of
 from progdf.painting.strokes import MAX_SIDE_PX
 from viewer.camera.view_camera import SHAPES, ViewCamera
@@ -31,6 +32,8 @@ SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "snapshots", "photograph")
 MAX_AMPLIFIED = 64.0  # largest factor of a difference view
+MAX_SCENES = 32
+"""Largest number of scenes in a view."""
 MAX_FRAME = 9999  # largest last frame of a timeline
 MAX_FPS = 120  # largest frame rate of a timeline, frames per second
 CARD_MODES = ("auto", "full", "compact")
@@ -69,6 +72,16 @@ class LayerState:
     paint: str = ""  # weight per member, from `layer_paint.encode`; empty is 1 everywhere
     group: str = ""  # name of its group, "" for none; the layers of a group are adjacent
     blend: LayerBlend = ""  # its own blend rule, "" for that of the stack
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Scene of a view with several scenes."""
+
+    scene: Annotated[int, Meta(ge=0)]  # index into the document's scenes
+    name: str  # unique in the view
+    visible: bool = True
+    placement: Placement = Placement()
 
 
 @dataclass(frozen=True)
@@ -200,6 +213,8 @@ class ViewState:
     mode: Annotated[str, one_of(VIEW_MODES)] = "splats"  # one of `VIEW_MODES`; in the window alone
     # true length of a world unit, by which the window shows and reads lengths; files keep world units
     unit: Unit = 1.0
+    # scenes of the view, in the order of the panel's rows; empty: the document's only scene
+    scenes: Annotated[tuple[SceneState, ...], Meta(max_length=MAX_SCENES)] = ()
 
     @property
     def has_tool(self) -> bool:

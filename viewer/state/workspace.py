@@ -60,6 +60,7 @@ class SceneFacts:
     rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
     added: int = 0  # number of Gaussians in `count` that edits added
     origin: Origin = ZERO  # world position of the scene's coordinate origin, see `Gaussians.origin`
+    scene_counts: tuple[int, ...] = ()  # number of Gaussians of each scene of a view with several
     fit: Fit = keep_camera  # framing of the scene, for the command `frame`
     # framing of a selection, for the command `frame`
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera

@@ -294,6 +294,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("save", "Save session", "Ctrl+S", types=True, row="Save session; Shift as…"),
         Command("save_as", "Save session as…", "Ctrl+Shift+S", types=True, row=JOINED),
         Command("open", "Open…", "Ctrl+O", "A scene, a session or an edit", types=True),
+        Command("add_scene", "Add scene…", "", "A second scene in this view", types=True),
         Command("decal", "Decal…", "", "Place a picture on a surface", types=True),
         Command(
             "export", "Export scene…", "Ctrl+E", "The edited scene", types=True, row="Export; Shift a page"

@@ -9,7 +9,8 @@ from .keys import TOPICS, Command, chords
 WORDS = {
     "new_edit": "hue, recolor, color, colour, saturation, brightness, contrast, exposure, grade, tint, "
     "style, prompt, layer, add layer, new layer, filter, AI, generate, texture, material",
-    "open": "LUT, cube, import, load, add scene, drop",
+    "open": "LUT, cube, import, load, drop",
+    "add_scene": "merge, second, combine, import, append",
     "fold": "opacity, transparency, alpha, fade, gain",
     "remove_selected": "erase, eraser, cut out, cut, clear, inpaint, get rid of",
     "remove": "delete layer, trash",

@@ -27,6 +27,7 @@ from viewer.commands.open_stack import stack_layers
 from viewer.commands.stack_options import StackOptions
 from viewer.commands.viewpoint import fit_camera, parse_orbit
 from viewer.files.document import load_edits
+from viewer.files.scenes import SceneFile
 from viewer.pictures import film
 
 SMALL = ("--size", "64x48", "--engine", "cpu")
@@ -382,7 +383,7 @@ def test_export_that_fails_verification_leaves_no_file(
 def test_second_edit_of_the_same_name_gets_a_number(stack: Stack, tmp_path: Path) -> None:
     for file in ("a.gdf", "b.gdf"):
         save_gdf(tmp_path / file, stack.gdfs[0])
-    gdfs = load_edits([tmp_path / "a.gdf", tmp_path / "b.gdf"], stack.scene, Path("bear.ply"))
+    gdfs = load_edits([tmp_path / "a.gdf", tmp_path / "b.gdf"], [SceneFile("bear", stack.scene)])
     assert [gdf.name for gdf in gdfs] == ["scarf", "scarf-2"]
     half = StackOptions(scene=Path("bear.ply"), set=("scarf-2=0.5",))
     assert [layer.strength for layer in stack_layers(gdfs, half)] == [0.0, 0.5]

@@ -21,6 +21,7 @@ from .pictures import PictureActions
 from .preview import PreviewActions
 from .pulling import PullActions
 from .scene_checks import StrayActions, UpActions
+from .scene_list import SceneListActions
 from .start import StartActions
 from .tidy import TidyActions
 from .training import JobActions
@@ -36,6 +37,7 @@ class WindowParts:
     jobs: JobActions
     deliver: DeliverActions
     start: StartActions
+    scene_list: SceneListActions
     up: UpActions
     strays: StrayActions
     maker: LayerMaker
@@ -53,6 +55,7 @@ class WindowParts:
             self.deliver,
             self.start,
             self.preview,
+            self.scene_list,
             self.strays,
             self.maker,
             self.tidy,
@@ -66,6 +69,7 @@ class WindowParts:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
         parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays, self.pulling)
         return (
+            self.scene_list.poll,
             self.maker.poll,
             *(part.poll for part in parts),
             self.file_actions.poll_dialog,
@@ -164,6 +168,13 @@ def make_parts(
         queue=jobs.queue,
     )
     maker = LayerMaker(store=store, documents=documents, messages=messages, edits=edits, wake=wake_window)
+    scene_list = SceneListActions(
+        store=store,
+        documents=documents,
+        messages=messages,
+        wait_for=wait_for,
+        open_scene=file_actions.open,
+    )
     return WindowParts(
         file_actions=file_actions,
         pictures=pictures,
@@ -171,10 +182,17 @@ def make_parts(
         jobs=jobs,
         deliver=DeliverActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
         start=start,
+        scene_list=scene_list,
         up=UpActions(store=store, documents=documents, messages=messages),
         strays=StrayActions(store=store, documents=documents, messages=messages),
         maker=maker,
-        tidy=TidyActions(store=store, documents=documents, maker=maker, engine=lambda: main_view.engine),
+        tidy=TidyActions(
+            store=store,
+            documents=documents,
+            maker=maker,
+            engine=lambda: main_view.engine,
+            place_scene=scene_list.place,
+        ),
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
         pulling=PullActions(
             store=store, documents=documents, maker=maker, engine=lambda: main_view.engine, wake=wake_window

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from progdf.errors import ProgdfError
+from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.threads import StoppedError, stopped_by
 from viewer.app.messages import Messages, Requests
@@ -136,6 +137,9 @@ class LayerMaker:
         def run() -> None:
             with stopped_by(making.stop):
                 make(name, making.path, making.advance)
+                if document.files:  # the edit was made on the merged scenes
+                    gdf, _ = document.own(load_gdf(making.path, document.original))
+                    save_gdf(making.path, gdf)
 
         making.future = (worker or self._worker).submit(run)
         making.future.add_done_callback(lambda _: self._wake())

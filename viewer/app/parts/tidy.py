@@ -142,6 +142,8 @@ class TidyActions:
         documents: the open document
         maker: makes the layers
         engine: returns the engine that draws the window; None without a window
+        place_scene: places the scene whose Gaussians are all moved; returns False if the moved Gaussians are
+            not those of one of several scenes
     """
 
     def __init__(
@@ -151,8 +153,10 @@ class TidyActions:
         documents: DocumentStore,
         maker: LayerMaker,
         engine: Callable[[], ViewEngine] | None = None,
+        place_scene: Callable[[Region, AffineMotion], bool] = lambda region, motion: False,
     ) -> None:
         self._engine = engine
+        self._place_scene = place_scene
         self._store = store
         self._documents = documents
         self._maker = maker
@@ -180,6 +184,8 @@ class TidyActions:
         self._maker.check_free()
         document = self._documents.get()
         selected = select_parts(document, self._store.get().view)
+        if len(selected.region):
+            document.scene_with(selected.region.members)
         if does == "remove":
             self._remove(selected)
             return
@@ -265,6 +271,9 @@ class TidyActions:
         gizmo = self._store.get().transient.gizmo
         steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
+            if gizmo.does == "transform" and self._place_scene(steps[0].region, _motion(gizmo)):
+                self._end()
+                return
             self._add(steps[0].does, steps, self._selected is not None and self._selected.leaves_paint, gizmo)
         self._end()
 
