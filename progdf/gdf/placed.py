@@ -8,7 +8,7 @@ band. All other offsets stay as they are. With the identity, all values keep the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -99,6 +99,24 @@ class Placement:
         pivot = center + torch.tensor(origin, dtype=torch.float64)
         shift = pivot + motion.shift + factor * (turned @ (self.offset - pivot))
         return _placement(turned @ self.rotation, factor * self.factor, shift)
+
+
+def placement_of(values: Sequence[float]) -> Placement:
+    """Return the placement of a shift, degrees about the axes x, y and z in turn, and a scale.
+
+    Args:
+        values: 3, 6 or 7 numbers
+
+    Raises:
+        ProgdfError: a number is out of range.
+    """
+    factor = values[6] if len(values) > 6 else 1.0
+    rotation = torch.eye(3, dtype=torch.float64)
+    for axis, angle in enumerate(values[3:6]):
+        turn = torch.zeros(1, 3, dtype=torch.float64)
+        turn[0, axis] = math.radians(angle)
+        rotation = rotation_matrices(turn_quats(turn))[0] @ rotation
+    return _placement(rotation, factor, torch.tensor(values[:3], dtype=torch.float64))
 
 
 def _placement(rotation: Tensor, factor: float, shift: Tensor) -> Placement:

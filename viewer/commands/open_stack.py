@@ -15,16 +15,17 @@ from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.placed import Placement, placement_of
 from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from viewer.camera.view_camera import Vec3, find_scene_up, first_camera, with_up
-from viewer.files import document, session
+from viewer.files import document, scenes, session
 from viewer.files.document import Document
 from viewer.state import layers as stacks
 from viewer.state.facts import describe_loaded
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import OVERSHOOT, LayerState, Timeline, ViewState
+from viewer.state.view_state import OVERSHOOT, LayerState, SceneState, Timeline, ViewState
 
 from .stack_options import NO_SCENE, DrawingOptions, StackOptions, is_number
 
@@ -63,7 +64,7 @@ class OpenStack:
     @property
     def files(self) -> tuple[Path, ...]:
         """Files that were read."""
-        files = (self.document.path, self.session)
+        files = (*(file.path for file in self.document.opened), self.session)
         return (*(path for path in files if path is not None), *self.document.gdf_paths)
 
     @property
@@ -106,7 +107,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     view = ViewState(overshoot=stack.overshoot)
     if drawing is not None:
         view = replace(view, background=parse_background(drawing.background))
-    opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
+    opened, states = _open_scenes(stack)
     for text in stack.region:
         check_edit(text.partition("=")[0], opened.gdfs, "--region")
     notes = [note for gdf in opened.gdfs if (note := describe_loaded(gdf))]
@@ -114,8 +115,55 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
         _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)
     up = drawing.up if drawing else "auto"
-    view = with_blends(replace(view, layers=layers), stack.blend)
+    view = with_blends(replace(view, layers=layers, scenes=states), stack.blend)
     return OpenStack(opened, view, up_option=up, warning="; ".join(notes))
+
+
+def _open_scenes(stack: StackOptions) -> tuple[Document, tuple[SceneState, ...]]:
+    """Return the scenes with their edits, and the states of the scenes; none for a single scene at its place.
+
+    An edit belongs to the last scene before it that it fits, or else to another one.
+    """
+    paths = [stack.scene]
+    gdfs: list[Path] = []
+    near: list[int] = []
+    for path in stack.gdfs:
+        if kind_of(path) == "scene":
+            paths.append(path)
+        else:
+            gdfs.append(path)
+            near.append(len(paths) - 1)
+    files = [document.load_file(path) for path in paths]
+    owners = [document.find_owner(path, files, at) for path, at in zip(gdfs, near, strict=True)]
+    opened = document.load_stack(files, gdfs, _placing(stack.region), owners)
+    view = ViewState(scenes=scenes.first_states(files[0].title))
+    for index, file in enumerate(files[1:], 1):
+        view = scenes.add_state(view, files[0].title, file.title, index, Placement())
+    placed = place_scenes(view.scenes, stack.place)
+    if len(files) == 1 and not stack.place:
+        placed = ()
+    return opened.arranged(placed), placed
+
+
+def place_scenes(states: tuple[SceneState, ...], texts: Sequence[str]) -> tuple[SceneState, ...]:
+    """Return the scenes at the placements of options `NAME=X,Y,Z[,RX,RY,RZ[,SCALE]]`.
+
+    Raises:
+        ProgdfError: there is no such scene, or a number is missing or out of range.
+    """
+    for text in texts:
+        name, _, numbers = text.rpartition("=")
+        found = [i for i, state in enumerate(states) if name in (state.name, Path(state.name).stem)]
+        if not found:
+            names = ", ".join(state.name for state in states) or "none, as only one scene is open"
+            raise ProgdfError(f"--place {text}: there is no scene of that name; the scenes are {names}")
+        values = [float(number) if is_number(number) else math.nan for number in numbers.split(",")]
+        if len(values) not in (3, 6, 7) or not all(map(math.isfinite, values)):
+            raise ProgdfError(f"--place {text}: write NAME=X,Y,Z, then degrees RX,RY,RZ, then a scale")
+        changed = list(states)
+        changed[found[0]] = replace(states[found[0]], placement=placement_of(values))
+        states = tuple(changed)
+    return states
 
 
 def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.WindowSession, Path | None]:
@@ -172,6 +220,9 @@ def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenSt
         for name, equals, rule in (t.rpartition("=") for t in stack.blend)
     ]
     view = with_blends(replace(saved.view, layers=layers), rules)
+    if stack.place:
+        view = replace(view, scenes=place_scenes(view.scenes, stack.place))
+        opened = replace(opened, document=opened.document.arranged(view.scenes))
     if up != "auto":  # otherwise the session's own
         view = replace(view, camera=with_up(view.camera, opened.up))
     return replace(opened, view=view)

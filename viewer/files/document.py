@@ -18,7 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply_view import stored_view
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, load_gdf
+from progdf.gdf.file import Gdf, fingerprint, load_gdf, read_gdf
 from progdf.io.atomic import numbered_names
 from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
@@ -30,7 +30,7 @@ from viewer.state.view_state import LayerState, SceneState
 from viewer.state.workspace import SceneFacts
 
 from . import scenes
-from .scenes import SceneFile
+from .scenes import OwnScene, SceneFile
 
 _Value = TypeVar("_Value")
 
@@ -127,6 +127,36 @@ class Document:
             )
         return found[0]
 
+    def own_scene(self, scene: int) -> OwnScene:
+        """Return a scene with its own rows and coordinates, as a run trains on it."""
+        file = self.opened[scene]
+        rows = scenes.rows_of(self.opened, scene)
+        return OwnScene(file, rows, self._state(scene).placement, self.original.origin)
+
+    def only_scene(self) -> OwnScene:
+        """Return the only visible scene.
+
+        Raises:
+            ProgdfError: there are several.
+        """
+        return self.own_scene(self.scene_with(torch.zeros(0, dtype=torch.int64)))
+
+    def scene_at(self, path: Path) -> int:
+        """Return the first scene with this file, or the first scene."""
+        for scene, file in enumerate(self.opened):
+            if file.path is not None and file.path.resolve() == path.resolve():
+                return scene
+        return 0
+
+    def file_at(self, path: Path) -> SceneFile:
+        """Return the first scene with this file, or the first scene."""
+        return self.opened[self.scene_at(path)]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of Gaussians of each scene."""
+        return tuple(len(file.gaussians) for file in self.opened)
+
     def with_scenes(self, *added: SceneFile) -> Document:
         """Return the document with further scenes, which stay hidden until a view lists them."""
         if not added:
@@ -201,7 +231,7 @@ class Document:
             added=len(scene) - len(self.original),
             bounds=self.bounds,
             origin=scene.origin,
-            scene_counts=tuple(len(file.gaussians) for file in self.files),
+            scene_counts=self.counts,
             rows=layer_rows(scene, self.gdfs, added),
             fit=lambda camera, aspect: fit_all(camera, shown, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
@@ -291,42 +321,55 @@ def empty() -> Document:
     return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, no_sh))
 
 
-def load(
-    scene: Path,
-    gdfs: Sequence[Path] = (),
+def load(scene: Path, gdfs: Sequence[Path] = (), place: RegionChooser = _own_region) -> Document:
+    """Load a scene and its edits; the arguments are those of `load_stack`."""
+    return load_stack([load_file(scene)], gdfs, place)
+
+
+def load_stack(
+    files: Sequence[SceneFile],
+    gdfs: Sequence[Path],
     place: RegionChooser = _own_region,
-    added: Sequence[Path] = (),
     owners: Sequence[int] = (),
 ) -> Document:
-    """Load a scene and its edits, or several scenes with theirs.
+    """Load the edits of one scene, or of several scenes.
 
     Args:
-        scene: file or folder of the scene
+        files: the scenes; further ones stay hidden until the document is `arranged`
         gdfs: files of the edits
         place: chooses the region of each edit's grade
-        added: files of further scenes, which stay hidden until the document is `arranged`
-        owners: scene of each edit, in the order of the scenes; missing ones: the first scene
+        owners: scene of each edit; missing ones: the first scene
 
     Raises:
         ProgdfError: a file is missing or damaged, or an edit was made for another scene.
     """
-    scene = scene_file(scene)
-    gaussians = load_scene(scene)
-    first = SceneFile(escape_text(scene_name(scene)), gaussians, scene)
-    opened = (first, *map(load_file, added))
-    edits = load_edits(gdfs, opened, place, owners)
-    document = Document(first.title, gaussians, edits, scene, tuple(gdfs), owners=tuple(owners))
-    return document.with_scenes(*opened[1:])
+    first, *added = files
+    edits = load_edits(gdfs, files, place, owners)
+    document = Document(first.title, first.gaussians, edits, first.path, tuple(gdfs), owners=tuple(owners))
+    return document.with_scenes(*added)
 
 
 def load_file(path: Path) -> SceneFile:
-    """Load a scene to add to a view.
+    """Load a scene.
 
     Raises:
         ProgdfError: the file is missing or damaged.
     """
     path = scene_file(path)
     return SceneFile(escape_text(scene_name(path)), load_scene(path), path)
+
+
+def find_owner(path: Path, files: Sequence[SceneFile], near: int) -> int:
+    """Return the scene of an edit: `near` if the edit fits it, else the first one that it fits, else `near`.
+
+    Raises:
+        ProgdfError: the file is missing or damaged.
+    """
+    if len(files) == 1:
+        return 0
+    stored = read_gdf(path).scene
+    order = (near, *range(len(files)))
+    return next((i for i in order if stored == fingerprint(files[i].gaussians)), near)
 
 
 def load_edits(

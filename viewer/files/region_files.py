@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
@@ -25,6 +26,9 @@ from viewer.jobs.training import edits_folder
 from viewer.state import selection
 from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, NewEdit
 from viewer.state.selection import NamedRegion, SelectionState, unpack
+
+from .document import Document
+from .scenes import OwnScene
 
 _REGION_KINDS = ("masks", "photomasks", "text", "changed")
 """Kinds of regions, besides those that every command supports."""
@@ -78,7 +82,22 @@ def region_rows(form: NewEdit, state: SelectionState, total: int) -> NDArray[np.
     return None if members is None else np.flatnonzero(unpack(members, total))
 
 
-def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> SelectionState:
+def own_scene(form: NewEdit, opened: Document, state: SelectionState) -> OwnScene:
+    """Return the scene that holds a form's region.
+
+    A region that only the trainer can find, and the whole scene, need a single visible scene.
+
+    Raises:
+        ProgdfError: the region spans several scenes.
+    """
+    rows = None if form.region == ALL else region_rows(form, state, len(opened.original))
+    held = np.zeros(0, np.int64) if rows is None else rows
+    return opened.own_scene(opened.scene_with(torch.from_numpy(held)))
+
+
+def keep_region(
+    state: SelectionState, name: str, folder: Path, total: int, counts: Sequence[int] = ()
+) -> SelectionState:
     """Save the selection as a region, with a file in a folder.
 
     If training made a region of the same Gaussians, it gets the name and becomes a saved region.
@@ -88,6 +107,7 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
         name: name of the region; it gets a number if a region or a file already has it
         folder: folder of the file
         total: number of Gaussians in the scene
+        counts: number of Gaussians of each of several merged scenes
 
     Returns:
         The new state; the given state if a saved region already has the same Gaussians.
@@ -102,11 +122,11 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
     if equal is not None:
         if not state.regions[equal].edit:
             return state
-        state = rename_region(state, equal, name, total)
+        state = rename_region(state, equal, name, total, counts)
         return selection.change_region(state, equal, replace(state.regions[equal], edit=""))
     path = _free_region_path(state, name, folder)
     state = selection.add_region(state, path.name.removesuffix(selection.SUFFIX), path)
-    write_region(state.regions[-1], total)
+    write_region(state.regions[-1], total, counts)
     return state
 
 
@@ -121,7 +141,9 @@ def check_members(members: bytes, total: int) -> None:
         raise ProgdfError("only paint is selected, and no edit can change it; select its object too")
 
 
-def rename_region(state: SelectionState, index: int, name: str, total: int) -> SelectionState:
+def rename_region(
+    state: SelectionState, index: int, name: str, total: int, counts: Sequence[int] = ()
+) -> SelectionState:
     """Rename a region and its file. An invalid index changes nothing.
 
     Raises:
@@ -133,7 +155,7 @@ def rename_region(state: SelectionState, index: int, name: str, total: int) -> S
     path = _free_region_path(
         selection.change_region(state, index, None), name, region.path.parent, region.path
     )
-    write_region(replace(region, path=path), total)
+    write_region(replace(region, path=path), total, counts)
     removes = path != region.path and _is_region_file(region.path) and region.path.exists()
     # a file with other rows does not belong to this region, even if the session names it
     if removes and filecmp.cmp(region.path, path, shallow=False):
@@ -143,19 +165,22 @@ def rename_region(state: SelectionState, index: int, name: str, total: int) -> S
     )
 
 
-def region_file(region: NamedRegion, total: int) -> Path:
+def region_file(region: NamedRegion, total: int, counts: Sequence[int] = ()) -> Path:
     """Return the path of the region's file, written again if it is missing.
 
     Raises:
         ProgdfError: the file cannot be written.
     """
     if not region.path.exists():
-        write_region(region, total)
+        write_region(region, total, counts)
     return region.path
 
 
-def write_region(region: NamedRegion, total: int) -> None:
+def write_region(region: NamedRegion, total: int, counts: Sequence[int] = ()) -> None:
     """Write the rows of a region. [M] int64
+
+    Of several merged scenes, a region of one of them gets the rows of that scene, as a training reads them. A
+    region of several keeps the rows of the merged scene.
 
     Raises:
         ProgdfError: the folder does not exist or cannot be written to, or the path is not valid for a region.
@@ -165,7 +190,14 @@ def write_region(region: NamedRegion, total: int) -> None:
             f"{region.path} is not a regular file that ends in {selection.SUFFIX}; "
             "rename the region to give it one"
         )
-    save_npy(region.path, np.flatnonzero(unpack(region.members, total)).astype(np.int64))
+    rows = np.flatnonzero(unpack(region.members, total)).astype(np.int64)
+    first = 0
+    for count in counts:
+        if len(rows) and first <= rows[0] and rows[-1] < first + count:
+            rows = rows - first
+            break
+        first += count
+    save_npy(region.path, rows)
 
 
 def region_folders(session: Path, scene: Path) -> tuple[Path, ...]:

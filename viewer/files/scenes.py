@@ -12,14 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians, concatenate
+from progdf.gaussians import ZERO, Gaussians, Origin, concatenate
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.gdf.placed import Placement, Target, carry_edit, place_scene
 from progdf.io.atomic import numbered_names
+from viewer.state.selection import SelectionState, take_rows
 from viewer.state.view_state import MAX_SCENES, SceneState, ViewState
 
 HIDDEN_LOGIT = -1e4
@@ -33,6 +36,48 @@ class SceneFile:
     title: str
     gaussians: Gaussians
     path: Path | None = None
+
+
+@dataclass(frozen=True)
+class OwnScene:
+    """Scene on which a run trains, with its own rows and coordinates; see `Document.own_scene`."""
+
+    file: SceneFile
+    rows: slice  # its rows in the merged scene
+    placement: Placement = Placement()
+    origin: Origin = ZERO  # origin of the merged scene
+
+    @property
+    def path(self) -> Path:
+        """File of the scene. Raises ProgdfError if there is none."""
+        if self.file.path is None:
+            raise ProgdfError("the scene has no file yet; open one first")
+        return self.file.path
+
+    @property
+    def count(self) -> int:
+        """Number of its Gaussians."""
+        return len(self.file.gaussians)
+
+    def selection(self, state: SelectionState, total: int) -> SelectionState:
+        """Return a selection of the merged scene, with `total` rows, as one of this scene."""
+        if self.rows == slice(0, total):
+            return state
+        return take_rows(state, total, np.arange(self.rows.start, self.rows.stop))
+
+    def camera(self, camera: Camera) -> Camera:
+        """Return a camera of the merged scene as a camera of this scene, with the same picture."""
+        own = self.file.gaussians.origin
+        if self.placement == Placement() and own == self.origin:
+            return camera
+        to_merged = torch.eye(4, dtype=torch.float64)
+        to_merged[:3, :3] = self.placement.factor * self.placement.rotation
+        here = torch.tensor(own, dtype=torch.float64)
+        there = torch.tensor(self.origin, dtype=torch.float64)
+        to_merged[:3, 3] = to_merged[:3, :3] @ here + self.placement.offset - there
+        viewmat = camera.viewmat.double() @ to_merged
+        viewmat[:3] /= self.placement.factor
+        return replace(camera, viewmat=viewmat.to(camera.viewmat))
 
 
 def rows_of(files: Sequence[SceneFile], scene: int) -> slice:

@@ -155,7 +155,8 @@ def open_session(path: Path) -> WindowSession:
             return None
         return from_mask(edit.region, torch.from_numpy(selection.unpack(edit.members, len(scene)).copy()))
 
-    opened = document.load(files[0], gdfs, place, files[1:], owners).arranged(file.view.scenes)
+    opened = document.load_stack([*map(document.load_file, files)], gdfs, place, owners)
+    opened = opened.arranged(file.view.scenes)
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     selection.check(view.selection, len(opened.scene))

@@ -43,7 +43,8 @@ def folder(tmp_path: Path) -> Path:
 def opened(folder: Path, *states: SceneState) -> Document:
     """Open both scenes and their edits as two states list them."""
     gdfs = (folder / "shirt.gdf", folder / "hat.gdf")
-    both = document.load(folder / "first.ply", gdfs, added=[folder / "second.ply"], owners=(0, 1))
+    files = [document.load_file(folder / name) for name in ("first.ply", "second.ply")]
+    both = document.load_stack(files, gdfs, owners=(0, 1))
     return both.arranged(states)
 
 

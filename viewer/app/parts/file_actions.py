@@ -185,7 +185,9 @@ class FileActions:
         self._claim_regions(path)
         self._write(path)
         for region in self._store.get().view.selection.regions:
-            region_files.region_file(region, len(self._documents.get().original))
+            region_files.region_file(
+                region, len(self._documents.get().original), self._documents.get().counts
+            )
         self.session_autosave.drop()
         self._claim.take(path)
         self.path = path
@@ -335,7 +337,7 @@ class FileActions:
         folder = (self.path or opened.path or Path()).resolve().parent
         view = self._store.get().view
         total = len(opened.original)
-        selection = region_files.keep_region(view.selection, name, folder, total)
+        selection = region_files.keep_region(view.selection, name, folder, total, opened.counts)
         self._store.change(replace(view, selection=selection))
         index = equal_region(selection, selection.members, total)
         kept_name = selection.regions[-1 if index is None else index].name
@@ -346,8 +348,9 @@ class FileActions:
 
     def _rename_region(self, action: Rename) -> None:
         view = self._store.get().view
-        total = len(self._documents.get().original)
-        renamed = region_files.rename_region(view.selection, action.index, action.text, total)
+        opened = self._documents.get()
+        total = len(opened.original)
+        renamed = region_files.rename_region(view.selection, action.index, action.text, total, opened.counts)
         self._store.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:

@@ -12,6 +12,8 @@ from viewer.app.messages import Messages, Requests
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
 from viewer.files.document import DocumentStore
+from viewer.files.scenes import OwnScene
+from viewer.files.session import WindowSession, visible_only
 from viewer.jobs import training
 from viewer.jobs.job_queue import JobQueue
 from viewer.jobs.training import EditOrder
@@ -61,10 +63,12 @@ class PaintingActions:
         painted = work.view.painted
         if not painted:
             raise ProgdfError("nothing is painted; paint on the scene with the color brush first")
-        scene = self._documents.get().file
+        own = self._documents.get().only_scene()
+        scene = own.path
         out = training.free_run(training.edits_folder(scene), replace(NewEdit(), name=_NAME).layer_name)
-        layers = exports.picture_layers(self._documents.get(), work.view)
-        files = self._write(painted, layers, out)
+        shown = visible_only(WindowSession(self._documents.get(), work.view))
+        layers = exports.picture_layers(shown.document, shown.view)
+        files = self._write(painted, layers, out, own)
         order = EditOrder(
             scene.resolve(),
             out,
@@ -83,17 +87,17 @@ class PaintingActions:
         self._messages.show(f"Making {out.name}; the paint stays on screen until its layer is ready")
 
     def _write(
-        self, painted: Sequence[PaintedPicture], layers: PictureLayers | None, out: Path
+        self, painted: Sequence[PaintedPicture], layers: PictureLayers | None, out: Path, own: OwnScene
     ) -> list[Path]:
         """Write paint with transparency beside a run, and its cameras and layers; return the paths."""
-        origin = self._documents.get().scene.origin
+        origin = own.file.gaussians.origin
         files = [out.with_name(f"{out.name}.view-{i + 1}.png").resolve() for i in range(len(painted))]
         if len(files) > 1 and any("," in str(path) for path in files):
             raise ProgdfError(
                 f"{out.parent} has a comma in its name, which separates pictures; rename the folder"
             )
         for path, picture in zip(files, painted, strict=True):
-            camera = to_camera(picture.camera, *picture.size)
+            camera = own.camera(to_camera(picture.camera, *picture.size))
             exports.painted_picture(path, pixels_of(picture), camera, origin, layers)
         return files
 

@@ -27,6 +27,7 @@ from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
 from viewer.files import region_files, user_files
 from viewer.files.document import DocumentStore
+from viewer.files.scenes import OwnScene
 from viewer.jobs import consent, training
 from viewer.jobs.preview_process import Preview, PreviewChild, PreviewInputs
 from viewer.render.engine import ViewEngine
@@ -155,7 +156,7 @@ class PreviewActions:
             self._end_live()
             return self._follow(self._painting)
         now = time.monotonic()
-        scene = self._documents.get().path
+        scene = self._scene()
         request = self._request()
         if request is None or scene is None:
             if self._behind is not None and self._behind.camera != self._store.get().view.camera:
@@ -347,6 +348,26 @@ class PreviewActions:
         self._texture = self._sheet = None
         self._ghosts = {}
 
+    def _scene(self) -> Path | None:
+        """Return the file of the scene that holds the form's region; None for no preview.
+
+        The process of another scene ends.
+        """
+        opened = self._documents.get()
+        if opened.path is None:
+            return None
+        try:
+            scene = self._own().path
+        except ProgdfError:  # the region spans several scenes, which the form reports when it trains
+            return None
+        if self._child is not None and self._child.scene != scene:
+            self._end()
+        return scene
+
+    def _own(self) -> OwnScene:
+        work = self._store.get()
+        return region_files.own_scene(work.form, self._documents.get(), work.view.selection)
+
     def _request(self) -> PreviewInputs | None:
         """Return the request for the form and the view; None for no preview."""
         work = self._store.get()
@@ -392,14 +413,15 @@ class PreviewActions:
         if request.editor == "grade":
             width, height = LOOK_PX
         try:
-            region = region_files.region_option(
-                work.form, child.folder, work.view.selection, len(self._documents.get().original)
-            )
+            opened = self._documents.get()
+            own = self._own()
+            state = own.selection(work.view.selection, len(opened.original))
+            region = region_files.region_option(work.form, child.folder, state, own.count)
         except (ProgdfError, OSError) as error:
             self._outstanding = False
             self._show(error_line(error), None, failed=True)
             return
-        self._number = child.ask(region, request, to_camera(request.camera, width, height))
+        self._number = child.ask(region, request, own.camera(to_camera(request.camera, width, height)))
         self._view_number = self._number
         self._outstanding = True
         self._region_sent = region
@@ -419,7 +441,9 @@ class PreviewActions:
         missing = next((style for style in STYLE_ORDER if style not in self._tiles), None)
         if missing is not None:
             painted = replace(view, editor=f"style:{missing}", estimate=False)
-            self._number = child.ask(self._region_sent, painted, to_camera(view.camera, *SHEET_PX))
+            self._number = child.ask(
+                self._region_sent, painted, self._own().camera(to_camera(view.camera, *SHEET_PX))
+            )
             self._tile = missing
             self._outstanding = True
 
@@ -475,7 +499,9 @@ class PreviewActions:
         elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
-            gdf = load_gdf(answer.grade, self._documents.get().original)
+            opened = self._documents.get()
+            scene = 0 if self._child is None else opened.scene_at(self._child.scene)
+            gdf = opened.place(load_gdf(answer.grade, opened.opened[scene].gaussians), scene)
             self._grade = self._sent, gdf, answer.grade
             if self._sent.kind[1] != "grade":  # remove the preview of the previous color
                 self._store.replace(with_transient(self._store.get(), live=()))

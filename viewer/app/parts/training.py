@@ -24,6 +24,7 @@ from viewer.app.messages import Messages, Requests, attempt, failure_line
 from viewer.app.parts.edits import EditActions
 from viewer.files import exports, region_files, user_files
 from viewer.files.document import DocumentStore
+from viewer.files.scenes import OwnScene
 from viewer.jobs import consent, training
 from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
@@ -145,8 +146,7 @@ class JobActions:
         self._leave_ghost = leave_ghost
         self._look_behind = look_behind
         self.queue = JobQueue()
-        self._scene: Path | None = None
-        self._followed = False  # the scene's stopped runs are in the queue
+        self._scenes: tuple[Path, ...] = ()  # the open scenes; their stopped runs are in the queue
         self._live: Path | None = None  # the recording on screen
         self._live_layers: tuple[LayerState, ...] = ()  # its layers
         self._live_due = 0.0
@@ -276,7 +276,7 @@ class JobActions:
         members = NamedRegion(out.name, out.with_name(f"{out.name}{SUFFIX}"), pack(mask), len(gdf.region))
         region_files.write_region(members, len(document.original))
         order = EditOrder(
-            document.file.resolve(),
+            document.own_scene(document.owner(gdf_index)).path.resolve(),
             out,
             out.name,
             region=f"file:{members.path}",
@@ -332,25 +332,25 @@ class JobActions:
         self._store.wake()
 
     def _enqueue(self, form: NewEdit) -> None:
-        scene = self._documents.get().file
-        out = training.free_run(training.edits_folder(scene), form.layer_name)
         document = self._documents.get()
         state = self._store.get().view.selection
-        region = region_files.region_option(form, out.parent, state, len(document.original), out.name)
-        threads = training.spare_threads()
+        own = region_files.own_scene(form, document, state)
+        out = training.free_run(training.edits_folder(own.path), form.layer_name)
+        state = own.selection(state, len(document.original))
+        region = region_files.region_option(form, out.parent, state, own.count, out.name)
         anchor = ""
         if form.choice.has_anchor and form.choice.setting != "program":
-            anchor = self._write_anchor(form, out)
+            anchor = self._write_anchor(form, out, own)
         if form.choice.is_outside:
             user_files.keep_outside(form.outside)
         order = EditOrder(
-            scene.resolve(),
+            own.path.resolve(),
             out,
             out.name,
             region=region,
             editor=form.spec,
             quick=form.quick,
-            threads=threads,
+            threads=training.spare_threads(),
             model=form.model_option,
             api_url=form.url,
             prompt=form.prompt,
@@ -372,22 +372,21 @@ class JobActions:
 
     def _lay_decal(self, _: None) -> None:
         """Queue the placed decal with its camera and its position in the picture."""
-        scene = self._documents.get().path
+        own = self._documents.get().only_scene()
         placed = self._decal_place()
         self._store.replace(with_transient(self._store.get(), gizmo=None))
-        if placed is None or scene is None:
+        if placed is None:
             return
         decal, camera, at = placed
-        path = decal.path
-        name = replace(NewEdit(), name=path.stem).layer_name
-        out = training.free_run(training.edits_folder(scene), name)
-        camera_file = exports.single_camera(out, camera, self._documents.get().scene.origin)
+        name = replace(NewEdit(), name=decal.path.stem).layer_name
+        out = training.free_run(training.edits_folder(own.path), name)
+        camera_file = exports.single_camera(out, own.camera(camera), own.file.gaussians.origin)
         order = EditOrder(
-            scene.resolve(),
+            own.path.resolve(),
             out,
             out.name,
             region=ALL,
-            editor=f"decal:{path.resolve()}",
+            editor=f"decal:{decal.path.resolve()}",
             quick=False,
             threads=training.spare_threads(),
             at=at,
@@ -408,7 +407,7 @@ class JobActions:
         write_file(order.draft, read_file(draft))
         self._edits.add(order.draft, order.name, strength)
 
-    def _write_anchor(self, form: NewEdit, run: Path) -> str:
+    def _write_anchor(self, form: NewEdit, run: Path, own: OwnScene) -> str:
         """Return the file of the picture that a sentence should follow, saved beside its run; "" for none.
 
         Raises:
@@ -419,15 +418,15 @@ class JobActions:
             return form.anchor
         path = run.with_name(f"{run.name}.anchor.png")
         pixels, camera = taken
-        exports.painted_picture(path, pixels, camera, self._documents.get().scene.origin)
+        exports.painted_picture(path, pixels, own.camera(camera), own.file.gaussians.origin)
         return str(path)
 
     def _paint_over(self, _: None) -> None:
         """Save the picture for editing in another program, and follow that file from now on."""
-        scene = self._documents.get().file
         form = self._store.get().form
-        run = training.free_run(training.edits_folder(scene), form.layer_name)
-        if path := self._write_anchor(form, run):
+        own = region_files.own_scene(form, self._documents.get(), self._store.get().view.selection)
+        run = training.free_run(training.edits_folder(own.path), form.layer_name)
+        if path := self._write_anchor(form, run, own):
             self._store.replace(replace(self._store.get(), form=replace(form, anchor=path)))
             self._follow(Path(path))
 
@@ -452,7 +451,7 @@ class JobActions:
         recording = order.newest_recording()
         edit = None
         if recording is not None and is_keepable(order):
-            edit = order.recorded_edit(recording, self._documents.get().original)
+            edit = order.recorded_edit(recording, self._documents.get().file_at(order.scene).gaussians)
         if edit is None:
             raise ProgdfError(f"{order.name} has no recording that is not a layer yet; resume it")
         save_gdf(order.kept_edit, edit)
@@ -492,7 +491,7 @@ class JobActions:
         self._taken.add(number)
         if task.fills:
             self._take_fill(task)
-        elif self._scene == task.scene:  # the result replaces the recordings
+        elif task.scene in self._scenes:  # the result replaces the recordings
             self._live = None
             if not self._take_result(task):
                 self._open_file(task.result)
@@ -507,10 +506,11 @@ class JobActions:
         The filled one leaves paint where the removal did.
         """
         document = self._documents.get()
-        removal = document.edit_of(Path(task.replaces)) if self._scene == task.scene else None
+        removal = document.edit_of(Path(task.replaces)) if task.scene in self._scenes else None
         if removal is not None and removal.anchors is not None and removal.anchors.leaves_paint:
-            save_gdf(task.result, leave_paint(load_gdf(task.result, document.original)))
-        if self._scene == task.scene and self._edits.replace_file(Path(task.replaces), task.result):
+            filled = load_gdf(task.result, document.file_at(task.scene).gaussians)
+            save_gdf(task.result, leave_paint(filled))
+        if task.scene in self._scenes and self._edits.replace_file(Path(task.replaces), task.result):
             self._messages.show("The hole is filled")
         else:
             self._messages.show(f"{task.name} is ready: {task.result}")
@@ -523,19 +523,20 @@ class JobActions:
 
     def leave_scene(self) -> None:
         """Reset the state of the old scene. Its runs continue, and their cards name that scene."""
-        self._followed = False
+        self._scenes = ()
         self._live = None
 
     def _follow_document(self) -> None:
-        """Add the scene's stopped runs of earlier sessions to the queue."""
-        if self._followed:
+        """Add the stopped runs of earlier sessions to the queue when scenes were opened."""
+        files = self._documents.get().opened
+        if len(files) == len(self._scenes):
             return
-        path = self._documents.get().path
-        self._followed, self._scene = True, path.resolve() if path is not None else None
-        if (scene := self._scene) is not None:
-            for draft in dict.fromkeys(self._documents.get().gdf_paths):
-                if (result := training.finished_edit(draft)) is not None:
-                    attempt(self._messages, partial(self._edits.finish, draft, result))
+        known = self._scenes
+        self._scenes = tuple(file.path.resolve() if file.path else Path() for file in files)
+        for draft in dict.fromkeys(self._documents.get().gdf_paths):
+            if (result := training.finished_edit(draft)) is not None:
+                attempt(self._messages, partial(self._edits.finish, draft, result))
+        for scene in {*self._scenes} - {*known, Path()}:
             for order in training.stopped_orders(training.edits_folder(scene), scene):
                 self.queue.add_stopped(order)
 
@@ -544,7 +545,7 @@ class JobActions:
         running = (job for job in self.queue.jobs if job.status == "running")
         orders = (job.task for job in running if job.number not in self._taken)
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
-        if order is None or order.scene != self._scene or now < self._live_due or order.replaces:
+        if order is None or order.scene not in self._scenes or now < self._live_due or order.replaces:
             return
         live = self._store.get().transient.live
         grade = order.out / "draft.gdf"
@@ -559,7 +560,8 @@ class JobActions:
             return
         begun = time.monotonic()
         document = self._documents.get()
-        if (edit := order.recorded_edit(recording, document.original)) is not None:
+        if (edit := order.recorded_edit(recording, document.file_at(order.scene).gaussians)) is not None:
+            edit = document.place(edit, document.scene_at(order.scene))
             layer = LayerState(len(document.gdfs), f"{edit.name} (training)", 1.0)
             self._documents.replace(document, (edit,), (layer,))
             self._live = recording
@@ -580,16 +582,16 @@ class JobActions:
         """Publish the jobs of this scene and the busy jobs of others to the panel."""
         jobs = tuple(
             replace(job_card(job), fills=self._filled_edit(job.task))
-            if job.task.scene == self._scene
+            if job.task.scene in self._scenes
             else replace(job_card(job), elsewhere=job.task.scene.name, keepable=False)
             for job in self.queue.jobs
-            if job.task.scene == self._scene or job.busy
+            if job.task.scene in self._scenes or job.busy
         )
         if jobs != self._store.get().jobs:
             self._store.replace(replace(self._store.get(), jobs=jobs))
             self._store.wake()
         layers = set(self._documents.get().gdf_paths)
-        runs = [job.task for job in self.queue.jobs if job.busy and job.task.scene == self._scene]
+        runs = [job.task for job in self.queue.jobs if job.busy and job.task.scene in self._scenes]
         orders = [run for run in runs if isinstance(run, EditOrder) and not run.is_delivered]
         waiting = {run.out for run in orders if layers.isdisjoint(run.drafts)}
         ghosts = self._store.get().transient.ghosts
