@@ -296,8 +296,8 @@ def _carry_motions(gdf: Gdf, placement: Placement) -> PartMotions | None:
         )
     rotation = placement.rotation
 
-    def turned(motion: AffineMotion) -> AffineMotion:
+    def rotate(motion: AffineMotion) -> AffineMotion:
         stretch = rotation @ motion.stretch @ rotation.T
         return replace(motion, turn=rotation @ motion.turn, stretch=(stretch + stretch.T) / 2.0)
 
-    return replace(motions, motions=tuple(tuple(map(turned, part)) for part in motions.motions))
+    return replace(motions, motions=tuple(tuple(map(rotate, part)) for part in motions.motions))

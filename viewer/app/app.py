@@ -147,7 +147,7 @@ class App:
                 raise self.failure
             for path in self.take_dropped():
                 with self.errors.guard():
-                    self.parts.file_actions.open(path)
+                    self.parts.scene_list.drop(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.messages.request(Plain("quit"))

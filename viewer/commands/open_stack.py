@@ -64,7 +64,7 @@ class OpenStack:
     @property
     def files(self) -> tuple[Path, ...]:
         """Files that were read."""
-        files = (*(file.path for file in self.document.opened), self.session)
+        files = (*(file.path for file in self.document.scene_files), self.session)
         return (*(path for path in files if path is not None), *self.document.gdf_paths)
 
     @property
@@ -142,7 +142,7 @@ def _open_scenes(stack: StackOptions) -> tuple[Document, tuple[SceneState, ...]]
     placed = place_scenes(view.scenes, stack.place)
     if len(files) == 1 and not stack.place:
         placed = ()
-    return opened.arranged(placed), placed
+    return opened.arrange(placed), placed
 
 
 def place_scenes(states: tuple[SceneState, ...], texts: Sequence[str]) -> tuple[SceneState, ...]:
@@ -222,7 +222,7 @@ def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenSt
     view = with_blends(replace(saved.view, layers=layers), rules)
     if stack.place:
         view = replace(view, scenes=place_scenes(view.scenes, stack.place))
-        opened = replace(opened, document=opened.document.arranged(view.scenes))
+        opened = replace(opened, document=opened.document.arrange(view.scenes))
     if up != "auto":  # otherwise the session's own
         view = replace(view, camera=with_up(view.camera, opened.up))
     return replace(opened, view=view)

@@ -62,13 +62,13 @@ class Document:
     live: tuple[Gdf, ...] = ()  # edits of `original` in training or preview, after the others
 
     @cached_property
-    def placed(self) -> tuple[Gdf, ...]:
+    def placed_edits(self) -> tuple[Gdf, ...]:
         """Edits as edits of `original`."""
         return tuple(self.place(gdf, self.owner(i)) for i, gdf in enumerate(self.edits))
 
     @cached_property
     def _extension(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
-        scene, gdfs = extend(self.original, (*self.placed, *self.live))
+        scene, gdfs = extend(self.original, (*self.placed_edits, *self.live))
         hidden = [
             gdf for i, gdf in enumerate(gdfs[: len(self.edits)]) if not self._state(self.owner(i)).visible
         ]
@@ -82,7 +82,7 @@ class Document:
         return scenes.state_of(self.states, scene)
 
     @property
-    def opened(self) -> tuple[SceneFile, ...]:
+    def scene_files(self) -> tuple[SceneFile, ...]:
         """All scenes that were opened."""
         return self.files or (SceneFile(self.title, self.original, self.path),)
 
@@ -129,8 +129,8 @@ class Document:
 
     def own_scene(self, scene: int) -> OwnScene:
         """Return a scene with its own rows and coordinates, as a run trains on it."""
-        file = self.opened[scene]
-        rows = scenes.rows_of(self.opened, scene)
+        file = self.scene_files[scene]
+        rows = scenes.rows_of(self.scene_files, scene)
         return OwnScene(file, rows, self._state(scene).placement, self.original.origin)
 
     def only_scene(self) -> OwnScene:
@@ -143,45 +143,45 @@ class Document:
 
     def scene_at(self, path: Path) -> int:
         """Return the first scene with this file, or the first scene."""
-        for scene, file in enumerate(self.opened):
+        for scene, file in enumerate(self.scene_files):
             if file.path is not None and file.path.resolve() == path.resolve():
                 return scene
         return 0
 
     def file_at(self, path: Path) -> SceneFile:
         """Return the first scene with this file, or the first scene."""
-        return self.opened[self.scene_at(path)]
+        return self.scene_files[self.scene_at(path)]
 
     @property
     def counts(self) -> tuple[int, ...]:
         """Number of Gaussians of each scene."""
-        return tuple(len(file.gaussians) for file in self.opened)
+        return tuple(len(file.gaussians) for file in self.scene_files)
 
     def with_scenes(self, *added: SceneFile) -> Document:
         """Return the document with further scenes, which stay hidden until a view lists them."""
         if not added:
             return self
         states = self.states or scenes.first_states(self.title)
-        return replace(self, files=(*self.opened, *added), states=states)._merged()
+        return replace(self, files=(*self.scene_files, *added), states=states)._merge()
 
-    def arranged(self, states: tuple[SceneState, ...]) -> Document:
+    def arrange(self, states: tuple[SceneState, ...]) -> Document:
         """Return the document with the scenes as a view lists them; the same object if nothing changes."""
         if states == self.states:
             return self
         if not self.files:
-            return replace(self, files=self.opened).arranged(states)
+            return replace(self, files=self.scene_files).arrange(states)
         is_same = [(s.scene, s.visible, s.placement) for s in states] == [
             (s.scene, s.visible, s.placement) for s in self.states
         ]
         first = self.files[states[0].scene if states else 0]
         changed = replace(self, states=states, title=first.title, path=first.path)
-        return changed if is_same else changed._merged()
+        return changed if is_same else changed._merge()
 
-    def _merged(self) -> Document:
+    def _merge(self) -> Document:
         return replace(self, original=scenes.merge(self.files, self.states))
 
     @property
-    def shown(self) -> Gaussians:
+    def visible_scene(self) -> Gaussians:
         """Original without the rows of hidden scenes."""
         hidden = self.hidden
         return self.original if not bool(hidden.any()) else self.original[~hidden]
@@ -207,12 +207,12 @@ class Document:
     def detected_up(self) -> SceneUp:
         """Up axis found from the first scene and its edits."""
         edits = [gdf for i, gdf in enumerate(self.edits) if self.owner(i) == 0]
-        return find_scene_up(self.opened[0].gaussians, edits, path=self.path)
+        return find_scene_up(self.scene_files[0].gaussians, edits, path=self.path)
 
     @cached_property
     def bounds(self) -> Bounds:
         """Bounds of the bulk of the visible scenes."""
-        return bounds_of(self.shown)
+        return bounds_of(self.visible_scene)
 
     @cached_property
     def stored_camera(self) -> Camera | None:
@@ -223,7 +223,7 @@ class Document:
         """Compute the facts for the panel and the camera."""
         scene = self.scene
         added = [gdf.members - len(gdf.region) for gdf in (*self.edits, *self.live)]
-        shown = self.shown
+        shown = self.visible_scene
         neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
             title=self.title,
@@ -335,7 +335,7 @@ def load_stack(
     """Load the edits of one scene, or of several scenes.
 
     Args:
-        files: the scenes; further ones stay hidden until the document is `arranged`
+        files: the scenes; further ones stay hidden until the document is arranged, see `arrange`
         gdfs: files of the edits
         place: chooses the region of each edit's grade
         owners: scene of each edit; missing ones: the first scene

@@ -156,7 +156,7 @@ def open_session(path: Path) -> WindowSession:
         return from_mask(edit.region, torch.from_numpy(selection.unpack(edit.members, len(scene)).copy()))
 
     opened = document.load_stack([*map(document.load_file, files)], gdfs, place, owners)
-    opened = opened.arranged(file.view.scenes)
+    opened = opened.arrange(file.view.scenes)
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     selection.check(view.selection, len(opened.scene))
@@ -316,7 +316,7 @@ def _without_layers(session: WindowSession) -> WindowSession:
     """Remove the layers of scenes that the view does not list."""
     opened = session.document
     listed = {state.scene for state in session.view.scenes} or {0}
-    if len(listed) == len(opened.opened):
+    if len(listed) == len(opened.scene_files):
         return session
 
     def keep(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
@@ -330,9 +330,9 @@ def _without_layers(session: WindowSession) -> WindowSession:
 def _drop_scenes(session: WindowSession) -> WindowSession:
     """Remove the scenes that the view does not list, and number the others again."""
     opened = session.document
-    states = session.view.scenes or scenes.first_states(opened.opened[0].title)
+    states = session.view.scenes or scenes.first_states(opened.scene_files[0].title)
     kept = sorted(state.scene for state in states)
-    if len(kept) == len(opened.opened):
+    if len(kept) == len(opened.scene_files):
         return session
     stays = np.ones(len(opened.scene), bool)
     for scene in range(len(opened.files)):
@@ -348,7 +348,7 @@ def _drop_scenes(session: WindowSession) -> WindowSession:
     )
     return replace(
         session,
-        document=remaining.with_scenes(*others).arranged(states),
+        document=remaining.with_scenes(*others).arrange(states),
         view=replace(session.view, scenes=states, selection=masks),
     )
 

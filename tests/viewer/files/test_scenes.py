@@ -45,7 +45,7 @@ def opened(folder: Path, *states: SceneState) -> Document:
     gdfs = (folder / "shirt.gdf", folder / "hat.gdf")
     files = [document.load_file(folder / name) for name in ("first.ply", "second.ply")]
     both = document.load_stack(files, gdfs, owners=(0, 1))
-    return both.arranged(states)
+    return both.arrange(states)
 
 
 def states(visible: bool = True) -> tuple[SceneState, ...]:
@@ -77,7 +77,7 @@ def test_merged_export_is_the_union_of_the_placed_exports(folder: Path) -> None:
 def test_layer_has_the_same_bits_with_and_without_a_second_scene(folder: Path) -> None:
     alone = document.load(folder / "first.ply", [folder / "shirt.gdf"])
     both = opened(folder, *states())
-    removed = both.arranged((states()[0],))
+    removed = both.arrange((states()[0],))
     for strength in (0.0, 0.5, 1.0):
         layers = (LayerState(0, "shirt", strength),)
         expected = rows(compose(alone, ViewState(layers=layers)), 0, 60)
@@ -87,11 +87,11 @@ def test_layer_has_the_same_bits_with_and_without_a_second_scene(folder: Path) -
 
 def test_hidden_scene_is_not_exported_and_returns_unchanged(folder: Path) -> None:
     shown = opened(folder, *states())
-    hidden = shown.arranged(states(visible=False))
+    hidden = shown.arrange(states(visible=False))
     edited = compose(hidden, stack(1.0, *states(visible=False)))
     assert len(edited) == 60
     assert not bool((hidden.scene.logit_opacities[60:] > -1000.0).any())
-    again = hidden.arranged(states())
+    again = hidden.arrange(states())
     for strength in (0.0, 1.0):
         view = stack(strength, *states())
         assert rows(compose(again, view), 0, 200) == rows(compose(shown, view), 0, 200)
@@ -99,7 +99,7 @@ def test_hidden_scene_is_not_exported_and_returns_unchanged(folder: Path) -> Non
 
 def test_window_edit_of_placed_scene_belongs_to_its_file(folder: Path) -> None:
     both = opened(folder, *states())
-    for i, gdf in enumerate(both.placed):
+    for i, gdf in enumerate(both.placed_edits):
         own, scene = both.own(gdf)
         assert scene == i
         assert own.scene == both.edits[i].scene
@@ -109,7 +109,7 @@ def test_window_edit_of_placed_scene_belongs_to_its_file(folder: Path) -> None:
     with pytest.raises(ProgdfError, match="belongs to one scene"):
         both.scene_with(torch.tensor([3, 70]))
     assert both.scene_with(torch.tensor([70])) == 1
-    assert both.arranged(states(visible=False)).scene_with(torch.tensor([]).long()) == 0
+    assert both.arrange(states(visible=False)).scene_with(torch.tensor([]).long()) == 0
 
 
 @pytest.mark.parametrize("bundled", [False, True])
@@ -144,7 +144,7 @@ def test_unlisted_scene_is_not_saved(folder: Path) -> None:
     both = opened(folder, *states())
     for index, name in ((0, "shirt"), (1, "hat")):
         listed = (states()[index],)
-        arranged = both.arranged(listed)
+        arranged = both.arrange(listed)
         view = stack(0.5, *listed)
         path = folder / f"{name}.session.json"
         session.save(path, WindowSession(arranged, replace(view, layers=view.layers)))
@@ -161,6 +161,6 @@ def test_unlisted_scene_is_not_saved(folder: Path) -> None:
 def test_equal_files_are_two_scenes(folder: Path) -> None:
     file = document.load_file(folder / "first.ply")
     listed = (SceneState(0, "first"), SceneState(1, "first-2", True, PLACED))
-    twice = document.load(folder / "first.ply").with_scenes(file).arranged(listed)
+    twice = document.load(folder / "first.ply").with_scenes(file).arrange(listed)
     assert isinstance(twice.files[1], SceneFile)
     assert len(compose(twice, ViewState(scenes=listed))) == 120

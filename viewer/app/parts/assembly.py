@@ -110,16 +110,13 @@ def make_parts(
     store = main_view.store
     messages = main_view.messages
 
-    def picture_size() -> tuple[int, int]:
-        return main_view.picture_size
-
     edits = EditActions(store=store, documents=documents, messages=messages)
     pictures = PictureActions(
         store=store,
         documents=documents,
         messages=messages,
         context=main_view.context,
-        picture_size=picture_size,
+        picture_size=lambda: main_view.picture_size,
         original=main_view.original_picture,
         wait_for=wait_for,
     )
@@ -141,7 +138,7 @@ def make_parts(
         documents=documents,
         messages=messages,
         context=main_view.context,
-        picture_size=picture_size,
+        picture_size=lambda: main_view.picture_size,
         save_edited=main_view.save_edited,
         engine=lambda: main_view.engine,
     )
@@ -167,14 +164,10 @@ def make_parts(
         context=main_view.context,
         queue=jobs.queue,
     )
-    maker = LayerMaker(store=store, documents=documents, messages=messages, edits=edits, wake=wake_window)
     scene_list = SceneListActions(
-        store=store,
-        documents=documents,
-        messages=messages,
-        wait_for=wait_for,
-        open_scene=file_actions.open,
+        store=store, documents=documents, messages=messages, wait_for=wait_for, open_file=file_actions.open
     )
+    maker, tidy, pulling = _manual_edits(main_view, documents, edits, scene_list)
     return WindowParts(
         file_actions=file_actions,
         pictures=pictures,
@@ -186,15 +179,27 @@ def make_parts(
         up=UpActions(store=store, documents=documents, messages=messages),
         strays=StrayActions(store=store, documents=documents, messages=messages),
         maker=maker,
-        tidy=TidyActions(
-            store=store,
-            documents=documents,
-            maker=maker,
-            engine=lambda: main_view.engine,
-            place_scene=scene_list.place,
-        ),
+        tidy=tidy,
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
-        pulling=PullActions(
-            store=store, documents=documents, maker=maker, engine=lambda: main_view.engine, wake=wake_window
-        ),
+        pulling=pulling,
     )
+
+
+def _manual_edits(
+    main_view: MainView, documents: DocumentStore, edits: EditActions, scene_list: SceneListActions
+) -> tuple[LayerMaker, TidyActions, PullActions]:
+    """Return the parts that edit the selection by hand."""
+    store = main_view.store
+    messages = main_view.messages
+    maker = LayerMaker(store=store, documents=documents, messages=messages, edits=edits, wake=wake_window)
+    tidy = TidyActions(
+        store=store,
+        documents=documents,
+        maker=maker,
+        engine=lambda: main_view.engine,
+        place_scene=scene_list.place,
+    )
+    pulling = PullActions(
+        store=store, documents=documents, maker=maker, engine=lambda: main_view.engine, wake=wake_window
+    )
+    return maker, tidy, pulling

@@ -149,7 +149,7 @@ class EditActions:
         state = self._store.get().view.selection
         mask = torch.from_numpy(selection.unpack(state.members, len(document.original)).copy())
         scene = document.scene_with(mask.nonzero()[:, 0])
-        rows = scenes.rows_of(document.opened, scene)
+        rows = scenes.rows_of(document.scene_files, scene)
         if state.count:
             return from_mask("selection", mask[rows]), scene
         return from_mask("all", torch.ones(rows.stop - rows.start, dtype=torch.bool)), scene
@@ -166,13 +166,15 @@ class EditActions:
         """
         document = self._documents.get()
         stored = read_gdf(path)
-        known = [i for i, file in enumerate(document.opened) if stored.scene == fingerprint(file.gaussians)]
+        known = [
+            i for i, file in enumerate(document.scene_files) if stored.scene == fingerprint(file.gaussians)
+        ]
         region = None
         if scene is None and known:
             scene = self._choose_scene(document, known)
         elif scene not in known and stored.field.kind == "grade":
             region, scene = choose()
-        file = document.opened[scene or 0]
+        file = document.scene_files[scene or 0]
         with all_threads():
             gdf = load_gdf(path, file.gaussians, place=lambda _: region)
         if note := describe_loaded(gdf):
@@ -184,7 +186,7 @@ class EditActions:
         state = self._store.get().view.selection
         selected = selection.unpack(state.members, len(document.original))
         for scene in known:
-            if len(known) > 1 and selected[scenes.rows_of(document.opened, scene)].any():
+            if len(known) > 1 and selected[scenes.rows_of(document.scene_files, scene)].any():
                 return scene
         visible = [state.scene for state in document.states if state.visible and state.scene in known]
         return visible[0] if visible else known[0]

@@ -501,7 +501,7 @@ class PreviewActions:
         elif answer.grade is not None:
             opened = self._documents.get()
             scene = 0 if self._child is None else opened.scene_at(self._child.scene)
-            gdf = opened.place(load_gdf(answer.grade, opened.opened[scene].gaussians), scene)
+            gdf = opened.place(load_gdf(answer.grade, opened.scene_files[scene].gaussians), scene)
             self._grade = self._sent, gdf, answer.grade
             if self._sent.kind[1] != "grade":  # remove the preview of the previous color
                 self._store.replace(with_transient(self._store.get(), live=()))

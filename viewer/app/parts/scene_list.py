@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Origin
 from progdf.gdf.placed import Placement
 from progdf.io.atomic import numbered_names
+from progdf.io.bundle import BUNDLE
+from progdf.io.picture_files import ENDINGS
 from progdf.region import Region
 from progdf.similarity import AffineMotion
 from progdf.terminal import format_count
@@ -20,7 +23,7 @@ from viewer.files import document, scenes
 from viewer.files.document import DocumentStore
 from viewer.files.user_files import parse_path
 from viewer.state import selection
-from viewer.state.commands import OnItem, Plain, Rename
+from viewer.state.commands import OnItem, Plain, Rename, WithText
 from viewer.state.layers import LONGEST_NAME, remove_layer
 from viewer.state.view_state import SceneState
 from viewer.state.workspace import Dialog, Store, focus_layer
@@ -34,7 +37,7 @@ class SceneListActions:
         documents: the open document
         messages: messages to the user
         wait_for: runs work in another thread while the window shows a text
-        open_scene: opens a scene instead of the open one
+        open_file: opens a file according to its content
     """
 
     def __init__(
@@ -44,13 +47,13 @@ class SceneListActions:
         documents: DocumentStore,
         messages: Messages,
         wait_for: WaitFor,
-        open_scene: Callable[[Path], None],
+        open_file: Callable[[Path], None],
     ) -> None:
         self._store = store
         self._documents = documents
         self._messages = messages
         self._wait_for = wait_for
-        self._open_scene = open_scene
+        self._open = open_file
 
     @property
     def requests(self) -> Requests:
@@ -69,11 +72,20 @@ class SceneListActions:
     def poll(self) -> float | None:
         """Arrange the scenes as the view lists them, for example after an undo."""
         opened = self._documents.get()
-        arranged = opened.arranged(self._store.get().view.scenes)
+        arranged = opened.arrange(self._store.get().view.scenes)
         if arranged is not opened:
             self._documents.replace(arranged)
             self._store.wake()
         return None
+
+    def drop(self, path: Path) -> None:
+        """Open a dropped file; ask whether a scene replaces the open one or is added to the view."""
+        if self._documents.get().path is None or not _is_scene(path):
+            self._open(path)
+            return
+        add = ("Add to this view", WithText("add_file", str(path)))
+        instead = ("Open instead", WithText("open_file", str(path)))
+        self._messages.offer(f"{path.name} is a scene", add, instead)
 
     def add(self, path: Path) -> None:
         """Add a scene to the view, at the coordinates of its file.
@@ -83,14 +95,14 @@ class SceneListActions:
         """
         opened = self._documents.get()
         if opened.is_empty:
-            self._open_scene(path)
+            self._open(path)
             return
         if opened.path is None:
             raise ProgdfError(f"{opened.title} has no file yet; save the scene first")
         file = self._wait_for(lambda: document.load_file(path), f"Adding {path.name} …")
         view = self._store.get().view
-        changed = scenes.add_state(view, opened.title, file.title, len(opened.opened), Placement())
-        self._documents.replace(opened.with_scenes(file).arranged(changed.scenes))
+        changed = scenes.add_state(view, opened.title, file.title, len(opened.scene_files), Placement())
+        self._documents.replace(opened.with_scenes(file).arrange(changed.scenes))
         self._store.change(changed)
         note = ""
         if file.gaussians.antialiased != opened.original.antialiased:
@@ -124,7 +136,7 @@ class SceneListActions:
     def _arrange(self, index: int, state: SceneState) -> None:
         """Set the state of a scene; if an edit does not allow it, nothing changes."""
         view = scenes.change_state(self._store.get().view, index, state)
-        arranged = self._documents.get().arranged(view.scenes)
+        arranged = self._documents.get().arrange(view.scenes)
         self._documents.replace(arranged)
         self._store.change(view)
 
@@ -193,7 +205,7 @@ class SceneListActions:
             view = remove_layer(view, i)
         states = tuple(other for other in view.scenes if other is not state)
         view = replace(view, scenes=states, selection=selection.select_none(view.selection))
-        self._documents.replace(opened.arranged(states))
+        self._documents.replace(opened.arrange(states))
         self._store.change(view)
         if view.layers:
             self._store.replace(focus_layer(self._store.get(), len(view.layers) - 1))
@@ -201,3 +213,13 @@ class SceneListActions:
             self._store.replace(replace(self._store.get(), focus=None))
         layers = f" and its {format_count(len(own), 'layer')}" if own else ""
         self._messages.show(f"Removed {state.name}{layers}; its file stays", button=("Undo", Plain("undo")))
+
+
+def _is_scene(path: Path) -> bool:
+    """Return whether a file is a scene. One that cannot be read is none."""
+    if path.name.endswith(BUNDLE) or path.suffix.lower() in ENDINGS:
+        return False
+    try:
+        return kind_of(path) == "scene"
+    except (ProgdfError, OSError):
+        return False

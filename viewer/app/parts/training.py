@@ -528,7 +528,7 @@ class JobActions:
 
     def _follow_document(self) -> None:
         """Add the stopped runs of earlier sessions to the queue when scenes were opened."""
-        files = self._documents.get().opened
+        files = self._documents.get().scene_files
         if len(files) == len(self._scenes):
             return
         known = self._scenes
