@@ -54,13 +54,14 @@ BENCHES: dict[str, str] = {
     "spill": "benchmarks.spill:tables",
     "recolors": "benchmarks.colors.recolors:tables",
     "packing": "benchmarks.colors.packing:tables",
+    "grading": "benchmarks.colors.grading:tables",
     "exports": "benchmarks.files.exports:tables",
     "ideal-editors": "benchmarks.editors.ideal_editors:tables",
 }
 
 PAGE = (
     *("training", "field", "packing", "order", "gains", "pull-stages", "viewer", "rasterize"),
-    *("warp", "moving", "popping", "painting", "pull-response", "frames", "exports", "hard"),
+    *("warp", "moving", "popping", "painting", "grading", "pull-response", "frames", "exports", "hard"),
 )
 """Benchmarks of docs/speed-and-error.md."""
 
@@ -126,6 +127,7 @@ def main(argv: Sequence[str]) -> int:
         "moving",
         "popping",
         "painting",
+        "grading",
         "pull-response",
         "window",
         "warps",

@@ -15,9 +15,11 @@ source it is this share for all colors. The curve of each source bends the light
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
@@ -280,10 +282,18 @@ def bend_lightness(lightness: Tensor, curve: Sequence[tuple[float, float]]) -> T
         lightness: 0 to 1. [...]
         curve: points (input, output), 0 to 1, in ascending order of input
     """
-    points = dict([(0.0, 0.0), (1.0, 1.0), *curve])
-    inputs = sorted(points)
-    table = PchipInterpolator(inputs, [points[x] for x in inputs])(np.linspace(0.0, 1.0, _CURVE_STEPS + 1))
-    steps = torch.from_numpy(table).to(lightness).clamp(0, 1)
+    steps = torch.from_numpy(_curve_table(tuple(curve))).to(lightness).clamp(0, 1)
     position = lightness.clamp(0, 1) * _CURVE_STEPS
     below = position.floor().long().clamp_max(_CURVE_STEPS - 1)
     return torch.lerp(steps[below], steps[below + 1], position - below)
+
+
+@lru_cache(maxsize=64)
+def _curve_table(curve: Curve) -> NDArray[np.float64]:
+    """Return the outputs of a curve for inputs from 0 to 1. [`_CURVE_STEPS` + 1]"""
+    points = dict([(0.0, 0.0), (1.0, 1.0), *curve])
+    inputs = sorted(points)
+    table: NDArray[np.float64] = PchipInterpolator(inputs, [points[x] for x in inputs])(
+        np.linspace(0.0, 1.0, _CURVE_STEPS + 1)
+    )
+    return table

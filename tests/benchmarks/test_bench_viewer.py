@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from benchmarks import __main__ as front
+from benchmarks.colors import grading
 from benchmarks.table import Table
 from benchmarks.viewer import frames as bench_frames
 from benchmarks.viewer import moving, painting, popping, pull_response, subject
@@ -313,6 +314,18 @@ def test_painting_benchmark_measures_a_stroke(monkeypatch: pytest.MonkeyPatch) -
     ctx.release()
     assert (len(times.dabs), len(times.turning)) == (3, 2)
     assert min(*times.dabs, *times.turning, times.press, times.release) > 0.0
+
+
+@pytest.mark.gl
+def test_grading_benchmark_drags_the_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grading, "WARM_UP", 2)
+    ctx = headless_context()
+    times = grading.measure(ctx, bear(600).gaussians, "all sections", steps=4, size=grading.SIZE)
+    ctx.release()
+    assert len(times.frames) == len(times.parts) == 4
+    assert len(set(times.parts)) == 4, "every frame is a new picture"
+    assert times.rest_db > 50.0
+    assert grading.table([times]).rows[0][:2] == ("600", "all sections")
 
 
 @pytest.mark.gl

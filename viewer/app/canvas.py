@@ -187,7 +187,8 @@ class Canvas:
         screen.use()
         screen.clear(*PALETTE.panel)
         aim = (view.camera, size)
-        edits = (view.layers, view.blend, view.background, view.mode, self.comparer.engine.version)
+        engine = self.comparer.engine
+        edits = (view.layers, view.blend, view.background, view.mode, engine.version, engine.live)
         turned = aim != self._last[0]
         slid = edits != self._last[1]
         self._last = (aim, edits)

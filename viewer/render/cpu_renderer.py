@@ -23,7 +23,7 @@ from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
 
-from .dynamic_resolution import DrawnView, LiveScene
+from .dynamic_resolution import DrawnView, LiveScene, MovingGrade
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 from .view_modes import RINGS, SPLATS
@@ -109,6 +109,17 @@ class CpuRenderer:
         self._changed = self._changed or len(rows) > 0
         self._scene.update(scene, attributes, rows)
 
+    def show_grade(self, graded: Gaussians | None, rows: NDArray[np.int64]) -> None:
+        """See `GlRenderer.show_grade`."""
+        self._cancel()
+        self._changed = True
+        self._scene.show_grade(graded, rows)
+
+    def grade_motion(self, grade: MovingGrade | None) -> bool:
+        """See `GlRenderer.grade_motion`."""
+        self._scene.moving_grade = grade
+        return self._scene.has_pyramid
+
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `GlRenderer.highlight`."""
         self._cancel()
@@ -141,7 +152,9 @@ class CpuRenderer:
         elif pending is not None and pending.picture.shown == shown:
             self.begun_ms = pending.drawn.result()
             picture = pending.picture.image, pending.picture.through
-        picture = picture or _draw(_in_mode(self._scene, shown), shown)
+        if picture is None:
+            self._scene.begin_full()
+            picture = _draw(_in_mode(self._scene, shown), shown)
         coarse = self._coarse(shown)
         if coarse is not None and mode == SPLATS:
             self._scene.measure(coarse.image, picture[0])
@@ -158,6 +171,7 @@ class CpuRenderer:
             return True
         if self._pending is None or self._pending.picture.shown != shown:
             self._cancel()
+            self._scene.begin_full()
             self._pending = _PendingPicture(self._scene, shown)
         return self._pending.drawn.done()
 

@@ -200,6 +200,14 @@ class DrawnView:
         )
 
 
+@dataclass(frozen=True)
+class MovingGrade:
+    """Grade of pictures during motion. It changes the colors of a picture's Gaussians, not the scene's."""
+
+    rows: NDArray[np.int64]  # graded rows of the scene, ascending. [M]
+    apply: Callable[[torch.Tensor], torch.Tensor]  # returns graded colors of drawn ones. [P,3] -> [P,3]
+
+
 class LiveScene:
     """Activated copy of the scene with its highlights, and a level-of-detail pyramid for motion.
 
@@ -217,7 +225,13 @@ class LiveScene:
             colors=scene.sh,
             antialiased=scene.antialiased,
         )
+        self.moving_grade: MovingGrade | None = None
+        """Grade of pictures during motion; None for none."""
         self._scene = scene
+        self._graded: tuple[Gaussians, NDArray[np.int64]] | None = None  # see `show_grade`
+        self._holds_grade = False  # whether `drawn` has the graded colors
+        self._cut: tuple[object, ActivatedGaussians] | None = None  # last cut with its inputs
+        self._shares: tuple[Pyramid, NDArray[np.int64], Array] | None = None  # see `_grade_cut`
         self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
         self._budget = BUDGETS[1]
         self._finest = ERROR_LIMITS_PX2[1]  # error limit of the next picture in motion, pixels²
@@ -244,6 +258,42 @@ class LiveScene:
         lacks = 1 if all(name in SH for name in names) else 2
         for outdated in (self._outdated, self._changed):
             outdated[rows] = np.maximum(outdated[rows], lacks)
+
+    def show_grade(self, graded: Gaussians | None, rows: NDArray[np.int64]) -> None:
+        """Draw full pictures with other base colors of some rows, until the next call.
+
+        Pictures during motion keep the scene's own colors, which the pyramid has merged, see `MovingGrade`.
+
+        Args:
+            graded: the scene with these base colors; None for its own
+            rows: ascending. [M]
+        """
+        if self._graded is not None and self._graded[1] is not rows:
+            self._hold_grade(False)
+        self._graded = (graded, rows) if graded is not None else None
+        self._holds_grade = graded is not None
+        self._write_base(graded or self._scene, rows)
+
+    def begin_full(self) -> None:
+        """Prepare `drawn` for a full picture."""
+        self._hold_grade(True)
+
+    def _hold_grade(self, held: bool) -> None:
+        """Put the graded colors into `drawn`, or the scene's own."""
+        if self._graded is None or self._holds_grade == held:
+            return
+        graded, rows = self._graded
+        self._write_base(graded if held else self._scene, rows)
+        self._holds_grade = held
+
+    def _write_base(self, scene: Gaussians, rows: NDArray[np.int64]) -> None:
+        for first, last in row_runs(rows):
+            self._write(scene, "sh0", slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW))
+
+    @property
+    def has_pyramid(self) -> bool:
+        """True if pictures during motion can be drawn."""
+        return self._pyramid is not None and self._pyramid.done()
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `GlRenderer.highlight`."""
@@ -286,16 +336,17 @@ class LiveScene:
         started = time.perf_counter()
         self._camera = camera
         self._pixels = pixels
+        self._hold_grade(False)
         pyramid = self._use_fit() or future.result()
-        for lacks in (2, 1):
-            rows = np.flatnonzero(self._outdated == lacks)
-            if len(rows):
-                pyramid.refresh(rows, colors_only=lacks == 1)
-        self._outdated[:] = 0
-        pyramid.finest = self._finest
-        fewer = pyramid.simplify(camera, self._budget, pixels)
-        self._limit = pyramid.limit
-        picture = draw(fewer)
+        if self._outdated.any():
+            for lacks in (2, 1):
+                rows = np.flatnonzero(self._outdated == lacks)
+                if len(rows):
+                    pyramid.refresh(rows, colors_only=lacks == 1)
+            self._outdated[:] = 0
+            self._cut = None
+        fewer = self._cut_scene(pyramid, camera, pixels)
+        picture = draw(self._grade_cut(pyramid, fewer))
         taken_ms = 1e3 * (time.perf_counter() - started)
         low, high = MOVING_MS
         if taken_ms > high or (taken_ms < low and len(fewer.means) > 0.8 * self._budget):
@@ -308,6 +359,26 @@ class LiveScene:
             finest *= 0.85
         self._finest = min(max(finest, ERROR_LIMITS_PX2[0]), self._max_finest)
         return picture
+
+    def _cut_scene(self, pyramid: Pyramid, camera: Camera, pixels: int) -> ActivatedGaussians:
+        """Return the Gaussians to draw. A still camera keeps them, as while the color of a region changes."""
+        view = (*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), camera.width, camera.height)
+        inputs = (id(pyramid), view, pixels, self._budget, self._finest)
+        if self._cut is None or self._cut[0] != inputs:
+            pyramid.finest = self._finest
+            self._cut = inputs, pyramid.simplify(camera, self._budget, pixels)
+            self._limit = pyramid.limit
+        return self._cut[1]
+
+    def _grade_cut(self, pyramid: Pyramid, fewer: ActivatedGaussians) -> ActivatedGaussians:
+        """Return the Gaussians to draw with the moving grade's colors, as far as its rows make them up."""
+        grade = self.moving_grade
+        if grade is None:
+            return fewer
+        if self._shares is None or self._shares[0] is not pyramid or self._shares[1] is not grade.rows:
+            self._shares = pyramid, grade.rows, pyramid.shares_of(grade.rows)
+        share = torch.from_numpy(self._shares[2][pyramid.picks])[:, None]
+        return fewer._replace(colors=torch.lerp(fewer.colors, grade.apply(fewer.colors), share))
 
     def measure(self, moving: Array, full: Array) -> None:
         """Measure the error limit that gives `FINE_ERROR`.

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import moderngl
 import numpy as np
@@ -30,7 +31,7 @@ from viewer.state.layers import visible_layers
 from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
-from .dynamic_resolution import DrawnView, FrameTimings, drawn_size
+from .dynamic_resolution import DrawnView, FrameTimings, MovingGrade, drawn_size
 from .gl_renderer import GlRenderer, Image, back_to_front, headless_context, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
@@ -262,7 +263,7 @@ class ViewEngine:
         if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(target.edits)
-        grade_ms = self._apply_live(live, camera, is_coarse=pixels > 1)
+        grade_ms = self._apply_live(live, camera, is_coarse=pixels > 1 and mode == SPLATS)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
         viewmat = camera.viewmat.numpy().tobytes()
@@ -298,10 +299,14 @@ class ViewEngine:
         return 1e3 * (composed - started), 1e3 * (time.perf_counter() - composed), len(change.rows)
 
     def _apply_live(self, live: LiveGrade | None, camera: Camera, is_coarse: bool = False) -> float:
-        """Update the base colors under the live grade and return the time taken, ms.
+        """Update the colors under the live grade and return the time taken, ms.
 
-        Coarse pictures of a moving camera keep the colors of its last position.
+        Pictures during motion are graded by themselves, see `MovingGrade`. Before they can be, they have the
+        colors of full pictures, from the last position.
         """
+        moving = None if live is None else MovingGrade(live.rows, partial(self._live_colors.recolor, live))
+        if self.renderer.grade_motion(moving) and is_coarse:
+            return 0.0
         if live is None and self._graded is None:
             return 0.0
         started = time.perf_counter()
@@ -309,20 +314,17 @@ class ViewEngine:
         if is_coarse and self._graded is not None:
             position = self._graded[0][2]
         inputs = (self._edits, self.composer, position)
-        if live is None:
-            rows = self._graded[1].rows if self._graded is not None else np.zeros(0, np.int64)
-            self.renderer.update(self.composer.gaussians, ("sh0",), rows)
+        last = self._graded
+        if last is not None and (live is None or last[1].rows is not live.rows):
+            self.renderer.show_grade(None, last[1].rows)
             self._graded = None
-        elif self._graded is None or self._graded[0] != inputs or self._graded[1] != live:
-            version = (self._edits, self.composer)
-            last = self._graded
-            if last is not None and last[1].rows is not live.rows:
-                self.renderer.update(self.composer.gaussians, ("sh0",), last[1].rows)
-            graded = self._live_colors.apply(self.composer.gaussians, live, camera, version)
-            self.renderer.update(graded, ("sh0",), live.rows)
-            self._graded = inputs, live
-        else:
+        elif last is not None and last[0] == inputs and last[1] == live:
             return 0.0
+        if live is not None:
+            version = (self._edits, self.composer)
+            graded = self._live_colors.apply(self.composer.gaussians, live, camera, version)
+            self.renderer.show_grade(graded, live.rows)
+            self._graded = inputs, live
         self._picture = None
         return 1e3 * (time.perf_counter() - started)
 

@@ -20,7 +20,7 @@ from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
 from viewer.gl.splats import DrawMode, GridPass, SplatRenderer
 
-from .dynamic_resolution import DrawnView, LiveScene
+from .dynamic_resolution import DrawnView, LiveScene, MovingGrade
 from .ground_grid import Lines
 from .view_modes import CENTERS, DOT_PX, RAMP_COLORS, RECOLORED, RINGS, SPLATS, depth_range
 
@@ -71,6 +71,24 @@ class GlRenderer:
         if self._moving is not None:
             self._moving[0].update(scene, names, rows)
         self._ctx.finish()
+
+    def show_grade(self, graded: Gaussians | None, rows: NDArray[np.int64]) -> None:
+        """Draw full pictures with other base colors of some rows.
+
+        Args:
+            graded: the scene with these base colors; None for its own
+            rows: sorted indices. [M]
+        """
+        self._shown = None
+        self._renderer.update(graded or self._scene, ("sh0",), rows)
+        self._ctx.finish()
+
+    def grade_motion(self, grade: MovingGrade | None) -> bool:
+        """Set the grade of pictures during motion. Return whether they do without the colors of full ones."""
+        if self._moving is None:
+            return False
+        self._moving[0].moving_grade = grade
+        return self._moving[0].has_pyramid
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """Override the colors of Gaussians until the next call, also when their own colors change.

@@ -23,6 +23,7 @@ from progdf.field.grade import look_up
 from progdf.formats.cube import read_cube
 from progdf.gaussians import Gaussians
 from progdf.sh import C0, basis
+from progdf.threads import run_chunks
 from viewer.jobs.preview_process import RegionSample
 from viewer.state.forms import CUBE_LOOK, NewEdit
 from viewer.state.transient import GradeScope
@@ -31,6 +32,7 @@ SIDE = 33
 """Points per edge of the lattice that grades many colors at once."""
 BINS = 64
 """Bins of the histogram."""
+_CHUNK_ROWS = 1 << 14  # rows that one thread shades at once
 _SCOPE_COLORS = 4096  # largest number of sampled colors of the histogram
 
 
@@ -73,14 +75,16 @@ class ColorTable:
 
     Args:
         colors: drawn colors, of any value. [M,3]
+        is_exact: grade each color by itself if there are fewer of them than points
     """
 
-    def __init__(self, colors: Tensor) -> None:
+    def __init__(self, colors: Tensor, is_exact: bool = True) -> None:
         self.colors = colors
         self._inside = colors.clamp(0.0, 1.0)
         self._points: Tensor | None = None
-        if len(colors) > SIDE**3:
-            self._points = used_points(self._inside)
+        if len(colors) > SIDE**3 or not is_exact:
+            points = used_points(self._inside)
+            self._points = points if len(points) < len(colors) else None
 
     def apply(self, live: LiveGrade) -> Tensor:
         """Return the colors after the grade: exact for few, from the lattice for many. [M,3]"""
@@ -126,6 +130,13 @@ class LiveColors:
     def __init__(self) -> None:
         self._key: object = None
         self._table: ColorTable | None = None
+        self._moving: ColorTable | None = None
+
+    def recolor(self, live: LiveGrade, colors: Tensor) -> Tensor:
+        """Return the graded colors of a picture during motion. [P,3] -> [P,3]"""
+        if self._moving is None or self._moving.colors is not colors:
+            self._moving = ColorTable(colors, is_exact=False)
+        return self._moving.apply(live)
 
     def apply(self, scene: Gaussians, live: LiveGrade, camera: Camera, version: object) -> Gaussians:
         """Return the scene with graded base colors of the grade's rows.
@@ -152,14 +163,31 @@ class LiveColors:
 
 
 def drawn_colors(scene: Gaussians, rows: Tensor, position: Tensor) -> Tensor:
-    """Return the colors of some rows from a position, below 0 where a lobe is black. [M,3]"""
+    """Return the colors of some rows from a position, below 0 where a lobe is black. [M,3]
+
+    Args:
+        scene: the scene
+        rows: ascending. [M] int64
+        position: of the camera, world units. [3]
+    """
     degree = min(scene.sh_degree, 3)
-    colors = scene.sh0[rows].float() * C0 + 0.5
     if not degree:
-        return colors
-    directions = torch.nn.functional.normalize(scene.means[rows].float() - position.float(), dim=1)
-    weights = basis(degree, directions)[:, 1:]
-    return colors + torch.einsum("mb,mbc->mc", weights, scene.shN[rows, : weights.shape[1]].float())
+        return scene.sh0[rows].float() * C0 + 0.5
+    colors = torch.empty(len(rows), 3)
+    has_gaps = len(rows) > 0 and int(rows[-1] - rows[0]) >= len(rows)
+
+    def shade(chunk: int) -> None:
+        part = slice(chunk * _CHUNK_ROWS, (chunk + 1) * _CHUNK_ROWS)
+        chosen = rows[part]
+        # a slice is read in place
+        where = chosen if has_gaps else slice(int(chosen[0]), int(chosen[-1]) + 1)
+        directions = torch.nn.functional.normalize(scene.means[where].float() - position.float(), dim=1)
+        weights = basis(degree, directions)[:, 1:]
+        lobes = torch.bmm(weights[:, None], scene.shN[where, : weights.shape[1]].float())[:, 0]
+        colors[part] = scene.sh0[where].float() * C0 + 0.5 + lobes
+
+    run_chunks(shade, -(-len(rows) // _CHUNK_ROWS))
+    return colors
 
 
 class FormGrader:

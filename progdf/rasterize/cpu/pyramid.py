@@ -128,6 +128,7 @@ class Pyramid:
         limit: threshold for a node's error, pixels². The last search ended here
         finest: smallest threshold of the search, pixels²
         gain: factor of the opacity of merged nodes, 0 to 1
+        picks: nodes of the last cut, and rows of the scene as their complement (~row). [M] int32
     """
 
     def __init__(self, gaussians: ActivatedGaussians) -> None:
@@ -144,6 +145,7 @@ class Pyramid:
         self.limit = 1.0
         self.finest = MIN_ERROR_PX2
         self.gain = 1.0
+        self.picks: Array = np.zeros(0, np.int32)
         self._places: Array | None = (
             None  # position of each row in the order, computed on first use. [N] int32
         )
@@ -182,6 +184,36 @@ class Pyramid:
             other._merge(level, np.arange(1 << level), colors_only=True)
         return other
 
+    def shares_of(self, rows: Array) -> Array:
+        """Return the share of some rows in each node, then in each row of the scene, the last row first.
+
+        So a pick indexes its share: nodes count from the start, and the complements of rows from the end.
+
+        Args:
+            rows: rows of the scene. [M] int64
+
+        Returns:
+            Shares of the nodes' colors, 0 to 1. [2L-1+N] float32
+        """
+        count = len(self.nodes.order)
+        levels = self.nodes.levels
+        total = (2 << levels) - 1
+        shares = np.zeros(total + count, np.float32)
+        own = shares[::-1][:count]
+        own[rows] = 1.0
+        starts = np.arange(1 << levels) * count >> levels
+        sizes = np.diff(starts, append=count)
+        leaves = np.add.reduceat(own[self.nodes.order], starts) if count else 0.0
+        shares[total - (1 << levels) : total] = leaves / np.maximum(sizes, 1)
+        weights = self.nodes.means[:, WEIGHT] + np.float32(MIN_WEIGHT)
+        for level in range(levels - 1, -1, -1):
+            first = (1 << level) - 1
+            last = 2 * first + 1
+            below = slice(last, 2 * last + 1)
+            parts = (weights[below] * shares[below]).reshape(-1, 2).sum(axis=1)
+            shares[first:last] = parts / weights[below].reshape(-1, 2).sum(axis=1)
+        return shares
+
     def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
         """Return the Gaussians to draw in place of the scene while the view changes.
 
@@ -196,7 +228,7 @@ class Pyramid:
         """
         view = make_pinhole(RasterView.of(camera, self.gaussians))
         dilation = DILATION / pixels**2
-        picks = self.cut(view, budget, dilation)
+        picks = self.picks = self.cut(view, budget, dilation)
         out = Scene(*(np.empty((len(picks), width), np.float32) for width in (3, 4, 3, 1, 3)))
 
         def take(begin: int, end: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,15 @@ from progdf.field.baked import lattice_colors
 from progdf.field.grade import look_up
 from progdf.formats.cube import SIDE as CUBE_SIDE
 from progdf.formats.cube import read_cube, read_settings, write_cube
+from progdf.rasterize import activate
+from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.sh import basis
 from tests.helpers.ui_rig import bear
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files import user_files
 from viewer.jobs.preview_process import RegionSample
 from viewer.render import live_grade
+from viewer.render.dynamic_resolution import LiveScene, MovingGrade
 from viewer.render.engine import ViewEngine
 from viewer.render.live_grade import (
     BLACK_MARK,
@@ -99,6 +104,65 @@ def test_engine_shows_the_live_grade_and_returns_to_the_scene() -> None:
     assert np.array_equal(picture(), graded)
     engine.live = None
     assert np.array_equal(picture(), before)
+
+
+def test_shares_of_rows_in_the_pyramid_follow_the_tree() -> None:
+    scene = bear().scene
+    pyramid = Pyramid(activate(scene))
+    total = len(pyramid.nodes.means)
+    rows = np.flatnonzero(scene.means[:, 0].numpy() > 0.0)
+    shares = pyramid.shares_of(rows)
+    assert shares.shape == (total + len(scene),)
+    assert set(np.flatnonzero(shares[::-1][: len(scene)])) == set(rows), "a pick ~row indexes from the end"
+    nodes = shares[:total]
+    assert ((nodes >= 0.0) & (nodes <= 1.0)).all()
+    for parent in range(total // 2):
+        children = nodes[2 * parent + 1 : 2 * parent + 3]
+        assert children.min() - 1e-6 <= nodes[parent] <= children.max() + 1e-6
+    everything = pyramid.shares_of(np.arange(len(scene)))
+    assert everything == pytest.approx(1.0)
+
+
+def test_pictures_in_motion_have_the_grade_and_leave_the_scene() -> None:
+    scene = with_lobes()
+    camera = to_camera(first_camera(scene), 64, 48)
+    rows = np.flatnonzero(scene.means[:, 0].numpy() > 0.0)
+    live = LiveScene(scene)
+    live.begin_pyramid().result()
+    before = live.drawn.colors.clone()
+    plain = live.draw_fewer(lambda fewer: fewer.colors.clone(), camera, 2)
+    colors = LiveColors()
+    grade = LiveGrade(rows, GRADE)
+    live.moving_grade = MovingGrade(rows, partial(colors.recolor, grade))
+    graded = live.draw_fewer(lambda fewer: fewer.colors.clone(), camera, 2)
+    assert plain is not None
+    assert graded is not None
+    share = torch.from_numpy(live._pyramid.result().shares_of(rows)[live._pyramid.result().picks])  # type: ignore[union-attr]
+    exact = torch.lerp(plain, grade_fully(plain, GRADE), share[:, None])
+    assert torch.allclose(graded, exact, atol=0.02), "as of the lattice"
+    assert torch.equal(graded[share == 0.0], plain[share == 0.0])
+    assert torch.equal(live.drawn.colors, before)
+    full = colors.apply(scene, grade, camera, 0)
+    live.show_grade(full, rows)
+    held = live.drawn.colors.clone()
+    assert not torch.equal(held, before)
+    live.draw_fewer(lambda fewer: None, camera, 2)
+    assert torch.equal(live.drawn.colors, before), "the pyramid reads the colors of the scene"
+    live.begin_full()
+    assert torch.equal(live.drawn.colors, held)
+    live.show_grade(None, rows)
+    assert torch.equal(live.drawn.colors, before)
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_colors_of_all_rows_equal_those_of_single_ones(every: int) -> None:
+    scene = with_lobes(3)
+    rows = torch.arange(5, len(scene), every)
+    position = torch.tensor([0.0, 1.0, -4.0])
+    colors = drawn_colors(scene, rows, position)
+    directions = torch.nn.functional.normalize(scene.means[rows] - position, dim=1)
+    expected = torch.einsum("mb,mbc->mc", basis(3, directions), scene.sh[rows]) + 0.5
+    assert torch.allclose(colors, expected, atol=1e-5)
 
 
 def test_clipped_colors_are_marked_and_counted() -> None:
