@@ -25,7 +25,7 @@ from trainer.views.setup import TrainingSetup
 from .evaluate import Evaluator
 from .slider_uniformity import equalizing_slider
 
-_OKLAB_KNOTS = 9
+_OKLAB_KNOTS = 5
 """Knots of a path in OKLab that is re-timed; between them the path is taken as straight."""
 _BLOCK = 2048  # members whose colors from all directions fit into a processor's cache
 
