@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from progdf.field import BakedField
 from progdf.field.choose import Field
 from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import decibels, edge_weights, ssim
@@ -21,6 +22,8 @@ from trainer.optimize.losses import Perceptual
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
 from trainer.views.view import View, crop
+
+from .still_path import still_path
 
 PACKING_MEMBERS = 20_000
 """Number of members up to which a packing is chosen on all of them, and of members in a sample."""
@@ -51,8 +54,20 @@ class Evaluator:
         return render_all(self.crops, rows, () if is_still else moving_attributes(offsets))
 
     def course(self, field: Field) -> Pictures:
-        """Return a function that renders every view at a slider value of a field."""
-        return lambda s: self.pictures(field.offsets(s))
+        """Return a function that renders every view at a slider value of a field.
+
+        It is fastest at ascending values, see `StillPath`.
+        """
+        path = still_path(self.crops, self.original, field) if isinstance(field, BakedField) else None
+        if path is None:
+            return lambda s: self.pictures(field.offsets(s))
+
+        def pictures(s: float) -> list[Tensor]:
+            if self.looked is not None:
+                self.looked()
+            return path(s)
+
+        return pictures
 
     def picture(self, offsets: Tensor, view: int) -> Tensor:
         """Render one view with these offsets. [M,C] -> [h,w,3]"""
