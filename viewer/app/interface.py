@@ -192,7 +192,9 @@ def _draw_question(work: Workspace, pointer: PointerContext) -> Workspace:
     area = pointer.area
     edge = tools.EDGE_PX * ui.scale
     is_narrow = area.width < tools.NARROW_PX * ui.scale
-    bars = ("view", "options", "placing", "comparison") if is_narrow else ("view",)
+    bars = ("view", "view mode")
+    if is_narrow:
+        bars += ("options", "placing", "comparison", "comparison note")
     above = [imgui.internal.find_window_by_name(name) for name in bars]
     shown = [window for window in above if window is not None and window.was_active]
     top = max((window.pos.y + window.size.y for window in shown), default=0.0) + edge

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.state.commands import Action, Plain, WithText
 from viewer.state.view_state import VIEW_MODES, ViewState
 from viewer.ui import overlay
-from viewer.ui.context import Icon, UiContext
+from viewer.ui.context import SMALL_PX, Icon, UiContext
+from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
     choice,
@@ -58,7 +59,31 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
         open_below(1.0, ui)
         with menu("view settings", ui) as is_open:
             view = _view_rows(view, ui, actions) if is_open else view
+        foot = imgui.get_window_pos().y + imgui.get_window_size().y
+    if view.mode != ViewState.mode:
+        _draw_mode(view.mode, (area.width - EDGE_PX * ui.scale, foot + PAD_PX * ui.scale), ui, actions)
     return view
+
+
+def _draw_mode(mode: str, corner: tuple[float, float], ui: UiContext, actions: list[Action]) -> None:
+    """Draw the name and key of the view mode; a click returns to the splats.
+
+    Args:
+        mode: the view mode
+        corner: upper right corner, window pixels
+        ui: fonts and scale
+        actions: receives the command of a click
+    """
+    key = shortcut("next_view_mode")
+    text = mode.capitalize() + (f" — {key}" if key else "")
+    with plate("view mode", corner, ui, (1.0, 0.0), PAD_PX):
+        imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
+        with imgui_ctx.push_font(None, SMALL_PX):
+            pressed = imgui.button(text)
+        imgui.pop_style_color()
+        hint("view_mode:splats")
+    if pressed:
+        actions.append(WithText("view_mode", ViewState.mode))
 
 
 def _view_rows(view: ViewState, ui: UiContext, actions: list[Action]) -> ViewState:

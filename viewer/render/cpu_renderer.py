@@ -26,7 +26,7 @@ from viewer.gl.present import ScreenCopy
 from .dynamic_resolution import DrawnView, LiveScene, MovingGrade
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
-from .view_modes import RINGS, SPLATS
+from .view_modes import RINGS, SPLATS, can_merge, depth_range
 from .view_modes import apply as apply_mode
 
 BAND = 300_000
@@ -147,8 +147,11 @@ class CpuRenderer:
         self.begun_ms = 0.0
         picture = None
         shown = DrawnView(camera, background, pixels, mode)
-        if pixels > 1 and mode == SPLATS:
-            picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, shown), camera, pixels)
+        if pixels > 1 and can_merge(mode, self._scene.highlights is not None):
+            ends = depth_range(self._scene.drawn.means, camera) if mode == "depth" else None
+            picture = self._scene.draw_fewer(
+                lambda fewer: _draw(apply_mode(fewer, None, camera, mode, ends), shown), camera, pixels
+            )
         elif pending is not None and pending.picture.shown == shown:
             self.begun_ms = pending.drawn.result()
             picture = pending.picture.image, pending.picture.through

@@ -22,7 +22,7 @@ from viewer.gl.splats import DrawMode, GridPass, SplatRenderer
 
 from .dynamic_resolution import DrawnView, LiveScene, MovingGrade
 from .ground_grid import Lines
-from .view_modes import CENTERS, DOT_PX, RAMP_COLORS, RECOLORED, RINGS, SPLATS, depth_range
+from .view_modes import CENTERS, DOT_PX, RAMP_COLORS, RECOLORED, RINGS, SPLATS, can_merge, depth_range
 
 Image = NDArray[np.float32]
 Size = tuple[int, int]  # width and height, pixels
@@ -118,14 +118,14 @@ class GlRenderer:
             background: rgb behind the scene
             order: rows, farthest first, from `back_to_front`
             pixels: full-resolution pixels per pixel of this picture, along each axis
-            mode: one of `view_state.VIEW_MODES`; all but splats draw every Gaussian
+            mode: one of `view_state.VIEW_MODES`
         """
         last = self._shown
         self._shown = DrawnView(camera, background, pixels, mode)
         coarse = self.pixels() if last is not None and last.is_coarse(self._shown) else None
         self._picture = None
-        if pixels > 1 and mode == SPLATS:
-            self._picture = self._draw_fewer(camera, background, pixels)
+        if pixels > 1:
+            self._picture = self._draw_fewer(camera, background, pixels, mode)
         if self._picture is None:
             order = order if pixels == 1 else back_to_front(self._scene.means.numpy(), camera)
             self._renderer.set_order(order)
@@ -141,18 +141,22 @@ class GlRenderer:
         dot_px = DOT_PX if mode == CENTERS else 0.0
         return DrawMode(colors, dot_px, mode == RINGS, depths, RAMP_COLORS)
 
-    def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> moderngl.Texture | None:
+    def _draw_fewer(
+        self, camera: Camera, background: Vec3, pixels: int, mode: str
+    ) -> moderngl.Texture | None:
         if self._moving is None:
             live = LiveScene(self._scene)
             live.highlight(*self._renderer.highlights)
             self._moving = live, SplatRenderer(self._ctx)
         live, renderer = self._moving
+        if not can_merge(mode, live.highlights is not None):
+            return None
 
         def draw(fewer: ActivatedGaussians) -> moderngl.Texture:
             gaussians = _to_raw(fewer)
             renderer.upload(gaussians, activated=True)
             renderer.set_order(back_to_front(gaussians.means[: len(fewer.means)].numpy(), camera))
-            picture = renderer.draw(camera, background)
+            picture = renderer.draw(camera, background, self._draw_mode(mode, camera))
             self._ctx.finish()
             return picture
 

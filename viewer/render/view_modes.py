@@ -6,7 +6,8 @@ depth    yellow is near, blue is far; the range is that of the centers in the pi
 normals  shortest axis, towards the camera: red right, green up, blue towards the camera
 opacity  blue is transparent, yellow is opaque
 
-Depth, normals and opacity are colors per Gaussian, blended like its own color.
+Depth, normals and opacity are colors per Gaussian, blended like its own color. Pictures in motion draw merged
+Gaussians, see `can_merge`.
 shaders/include/view_modes.glsl has the same formulas.
 """
 
@@ -40,6 +41,14 @@ MAX_SAMPLE = 50_000  # number of centers from which the depth range is measured
 
 RAMP_COLORS = tuple(rgba(color)[:3] for _, color in RAMP)
 """Colors of the ramp at 0, 1/4, 1/2, 3/4 and 1."""
+
+
+def can_merge(mode: str, has_highlights: bool) -> bool:
+    """Return whether a picture in motion may draw merged Gaussians in a mode.
+
+    They have no opacity that compares with those of the scene, and no highlight beside their color.
+    """
+    return mode != "opacity" and not (has_highlights and mode in RECOLORED)
 
 
 def depth_range(means: Tensor, camera: Camera) -> tuple[float, float]:
@@ -76,23 +85,31 @@ def visible_count(scene: Gaussians, camera: Camera, near: float) -> int:
 
 
 def apply(
-    gaussians: ActivatedGaussians, highlights: Tensor | None, camera: Camera, mode: str
+    gaussians: ActivatedGaussians,
+    highlights: Tensor | None,
+    camera: Camera,
+    mode: str,
+    depths: tuple[float, float] | None = None,
 ) -> ActivatedGaussians:
     """Return the Gaussians as a mode shows them from a camera. Rings are drawn by another kernel.
 
     Args:
-        gaussians: the scene, with its highlights in the colors
+        gaussians: the scene, or merged Gaussians in its place, with highlights in the colors
         highlights: rgb and share of the highlights, 0 to 1, or None. [N,4]
         camera: the view
         mode: one of `view_state.VIEW_MODES`
+        depths: near and far end of the depth colors, world units; None for those of `gaussians`
     """
     if mode == CENTERS:
         return _dots(gaussians, camera)
     if mode not in RECOLORED:
         return gaussians
-    colors = {"depth": _depth_colors, "normals": _normal_colors, "opacity": _opacity_colors}[mode](
-        gaussians, camera
-    )
+    if mode == "depth":
+        colors = _depth_colors(gaussians, camera, depths or depth_range(gaussians.means, camera))
+    elif mode == "normals":
+        colors = _normal_colors(gaussians, camera)
+    else:
+        colors = ramp(gaussians.opacities)
     if highlights is not None:
         colors = colors + highlights[:, 3:] * (highlights[:, :3] - colors)
     return gaussians._replace(colors=colors)
@@ -110,13 +127,9 @@ def _depths(gaussians: ActivatedGaussians, camera: Camera) -> Tensor:
     return depths.float()
 
 
-def _depth_colors(gaussians: ActivatedGaussians, camera: Camera) -> Tensor:
-    near, far = depth_range(gaussians.means, camera)
+def _depth_colors(gaussians: ActivatedGaussians, camera: Camera, ends: tuple[float, float]) -> Tensor:
+    near, far = ends
     return ramp((far - _depths(gaussians, camera)) / (far - near))
-
-
-def _opacity_colors(gaussians: ActivatedGaussians, camera: Camera) -> Tensor:
-    return ramp(gaussians.opacities)
 
 
 def _normal_colors(gaussians: ActivatedGaussians, camera: Camera) -> Tensor:

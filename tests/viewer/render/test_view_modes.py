@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 import torch
 
+from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.rasterize import activate
 from tests.helpers.scenes import front_camera, random_gaussians
 from tests.helpers.stacks import Stack, view_of
+from viewer.camera.view_camera import first_camera
+from viewer.render import dynamic_resolution
 from viewer.render.engine import ViewEngine
 from viewer.render.highlight import SELECTED, TINT, Highlight
 from viewer.render.view_modes import RAMP_COLORS, apply, depth_range
 from viewer.state.selection import pack
-from viewer.state.view_state import VIEW_MODES
+from viewer.state.view_state import VIEW_MODES, ViewState
 
 SIZE = (160, 120)
 
@@ -36,6 +39,23 @@ def test_both_engines_draw_a_mode_alike(
     images = [engine.image(view, SIZE, mode=mode) for engine in (gl_engine, cpu_engine)]
     error = np.square(images[0].astype(np.float64) - images[1]).mean()
     assert error < 1e-7  # 70 dB: back-to-front blending lacks the early stop, see `SplatRenderer`
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("mode", [mode for mode in VIEW_MODES if mode != "opacity"])
+def test_both_engines_move_alike_in_a_mode(ctx: moderngl.Context, mode: str) -> None:
+    scene = bear(6000).gaussians
+    view = ViewState(camera=first_camera(scene), background=(1.0, 1.0, 1.0))
+    images = []
+    for draw in ("gl", "cpu"):
+        engine = ViewEngine(ctx, scene, (), draw)
+        engine.image(view, SIZE, pixels=2, mode=mode)
+        dynamic_resolution._worker().submit(int).result()  # the pyramid is finished now
+        images.append(engine.image(view, SIZE, pixels=2, mode=mode))
+        whole = engine.image(view, SIZE, mode=mode)
+        engine.release()
+        assert not np.array_equal(images[-1], whole), "it has merged Gaussians"
+    assert np.square(images[0].astype(np.float64) - images[1]).mean() < 1e-6
 
 
 def test_view_mode_stays_out_of_pictures(cpu_engine: ViewEngine, stack: Stack) -> None:
