@@ -10,7 +10,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -
 
 EXTRAS := styles,diffusion,api,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes,docs
 
-.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples site
+.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples site packages
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -100,3 +100,7 @@ site: setup extras
 # What the start page opens with, and the wheel holds: trained anew in some minutes.
 examples: setup
 	$(BIN)/python assets/examples.py runs/examples
+
+# The sdist and the wheel in dist/, tried in an empty environment. Add ARGS='--python python3.12 --installer uv-tool'.
+packages: setup
+	$(BIN)/python -m release.packages $(ARGS)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("progdf", "trainer", "viewer", "shaders", "benchmarks", "tests")
+PACKAGES = ("progdf", "trainer", "viewer", "shaders", "benchmarks", "release", "tests")
 DOCUMENTS = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),

@@ -66,6 +66,7 @@ DRY_RUNS = {
     "make bench": "measures for an hour; its benchmarks run small in other tests",
     "make pictures": "overwrites the pictures of the documents",
     "make site": "installs packages; a test of its own builds the site",
+    "make packages": "installs packages for minutes",
     "make examples": "trains for minutes; the same edits are trained small in other tests",
 }
 """Targets of the Makefile that are only expanded, and why."""

@@ -1,0 +1,1 @@
+"""Scripts that make and check a release; not in the wheel."""
