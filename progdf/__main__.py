@@ -20,7 +20,8 @@ from typing import NoReturn
 
 from .errors import ProgdfError, is_out_of_memory
 from .io.atomic import disk_full, state_folder, write_file
-from .terminal import ENDINGS, PrintableFormatter, elide, escape_text, handle_signals
+from .system.processes import ENDINGS, handle_signals
+from .terminal import PrintableFormatter, elide, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),

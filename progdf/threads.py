@@ -17,6 +17,8 @@ from typing import TypeVar
 
 import torch
 
+from progdf.system.processes import usable_cores
+
 _A = TypeVar("_A")
 _T = TypeVar("_T")
 
@@ -62,7 +64,7 @@ def set_threads(count: int | None) -> None:
 
 def threads() -> int:
     """Return the number of threads of the next call of the cpu engine."""
-    return _cores() if _thread_count is None else _thread_count
+    return usable_cores() if _thread_count is None else _thread_count
 
 
 class StoppedError(Exception):
@@ -148,12 +150,8 @@ def stream_threads(work: Callable[[_A], _T], items: Sequence[_A]) -> Iterator[_T
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, _cores() - 1), "kernels", torch.set_num_threads, (1,))
+    return ThreadPoolExecutor(max(1, usable_cores() - 1), "kernels", torch.set_num_threads, (1,))
 
 
 if hasattr(os, "register_at_fork"):  # a forked process inherits the pool without its threads
     os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)

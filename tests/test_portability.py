@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, is_portable
+from progdf.io.atomic import is_portable
 from tests.helpers.paths import ROOT
 from tests.test_structure import parse, source_files
 
@@ -52,35 +51,6 @@ def test_window_trainings_start_stop_resume_and_die_as_on_windows(tmp_path: Path
     assert [line.endswith("--resume") for line in children] == [False, True, False]
 
 
-@pytest.mark.parametrize("times", [1, 3, 100])
-def test_file_opened_elsewhere_is_replaced_once_it_is_closed(
-    times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "a.txt"
-    real = os.replace
-    calls = 0
-
-    def replace(source: Path, target: Path) -> None:
-        nonlocal calls
-        calls += 1
-        if calls <= times:
-            error = PermissionError(13, "The process cannot access the file", str(target))
-            error.winerror = 32  # type: ignore[attr-defined]
-            raise error
-        real(source, target)
-
-    path.write_text("old", encoding="utf-8")
-    monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr("progdf.io.atomic._RETRY_DELAYS_S", (0.0,) * 5)
-    try:
-        with atomic_write(path) as temporary_file:
-            temporary_file.write_text("new", encoding="utf-8")
-    except (PermissionError, ProgdfError):
-        assert times == 100
-    assert path.read_text("utf-8") == ("old" if times == 100 else "new")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
-
-
 @pytest.mark.parametrize(
     "name", ["CON", "nul.x", "Com1.png", "lpt².a.b", "aux ", "a.", "b ", "conout$", "a:b"]
 )
@@ -91,6 +61,32 @@ def test_names_invalid_on_windows_are_not_portable(name: str) -> None:
 @pytest.mark.parametrize("name", ["console", "nulls.x", "a.con", "view_001", "lpt", "é"])
 def test_ordinary_names_are_portable(name: str) -> None:
     assert is_portable(name)
+
+
+SYSTEM_NAMES = {"sys.platform", "os.name", "platform.system", "os.startfile", "os.killpg", "os.setpriority"}
+"""Names whose use means that a module treats systems differently."""
+
+WITHOUT_PACKAGE = Path("progdf/io/native_child.py")
+"""Script that imports nothing of the package, so it has its own test of the system."""
+
+
+def system_tests(source: str) -> set[str]:
+    """Return the names of `SYSTEM_NAMES` that a source uses."""
+    return {
+        ast.unparse(node) for node in ast.walk(parse(source)) if isinstance(node, ast.Attribute)
+    } & SYSTEM_NAMES
+
+
+def test_only_one_package_asks_for_the_system() -> None:
+    found = {
+        path: names
+        for path in source_files()
+        if path.parts[:2] != ("progdf", "system") and path != WITHOUT_PACKAGE
+        for names in [system_tests((ROOT / path).read_text(encoding="utf-8"))]
+        if names
+    }
+    assert not found
+    assert system_tests("import sys\nif sys.platform == 'win32': pass") == {"sys.platform"}
 
 
 def text_without_encoding(tree: ast.AST) -> Iterator[int]:

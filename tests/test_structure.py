@@ -32,9 +32,9 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # its table of commands names all
 
 # Order of the folders and top-level files of each package. Each imports only from earlier ones.
 ORDER = {
-    "progdf": """quaternions sh gaussians similarity terminal errors threads region camera color metrics
-        demo_scenes io rasterize surface painting field formats gdf scene compose fade pull tidy summary cli
-        __init__ __main__""",
+    "progdf": """system quaternions sh gaussians similarity terminal errors threads region camera color
+        metrics demo_scenes io rasterize surface painting field formats gdf scene compose fade pull tidy
+        summary cli __init__ __main__""",
     "trainer": """__init__ options quality store views paint fill editors resolve regions
         motion optimize paper fit methods report preview run evaluate batch cli""",
     "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
-from progdf.terminal import lower_priority, print_line
+from progdf.system.processes import lower_priority
+from progdf.terminal import print_line
 
 from .options import (
     BatchOptions,

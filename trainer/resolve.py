@@ -7,7 +7,6 @@ is available. Resolved options determine a result bit for bit, except for the co
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.rasterize import set_threads
 from progdf.rasterize.engines import choose_engine, engine_device
+from progdf.system.processes import usable_cores
 from trainer.editors import EDITORS, editor_row
 from trainer.editors.instruct import parse_guidance
 from trainer.editors.pictures import strengths_of
@@ -292,5 +292,4 @@ def count_threads(threads: int) -> int:
     """
     if not 0 <= threads <= MAX_THREADS:
         raise ProgdfError(f"--threads must be between 0 and {MAX_THREADS}, got {threads}")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return threads or cores
+    return threads or usable_cores()

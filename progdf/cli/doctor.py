@@ -24,6 +24,8 @@ from typing import Literal
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import cache_folder, state_folder
+from progdf.system.desktop import has_display
+from progdf.system.processes import usable_cores
 from progdf.terminal import file_size, format_count, print_line
 
 PACKAGE = "progdf-studio"
@@ -177,9 +179,8 @@ def _processor() -> Finding:
             r"^model name\s*:\s*(.+)$", listing.read_text(encoding="utf-8", errors="replace"), re.MULTILINE
         )
         name = model.group(1) if model else name
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     settings = [f"{key}={os.environ[key]}" for key in VARIABLES if key in os.environ]
-    return Finding("ok", "processor", ", ".join([f"{name}, {usable} usable cores", *settings]))
+    return Finding("ok", "processor", ", ".join([f"{name}, {usable_cores()} usable cores", *settings]))
 
 
 def _memory() -> Finding:
@@ -227,7 +228,7 @@ def _opengl(scene: Path) -> Finding:
 def _window(scene: Path) -> Finding:
     """Test a window. A machine without a display is no failure: the other commands work on it."""
     made = _run("window-test")
-    if made.status == 2 and not _has_display():
+    if made.status == 2 and not has_display():
         return Finding("note", "window", "no display here; all commands except view work")
     return _judge("window", made, made.output.strip())
 
@@ -255,12 +256,6 @@ def describe_card(argv: Sequence[str]) -> int:
     engine = "with warp-lang" if _version_of("warp-lang") else "warp-lang is missing: install the extra gpu"
     print_line(f"{properties.name}, {file_size(properties.total_memory)}, {engine}")
     return 0
-
-
-def _has_display() -> bool:
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _judge(subject: str, made: Outcome, success: str) -> Finding:

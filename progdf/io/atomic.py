@@ -9,7 +9,6 @@ import platform
 import re
 import secrets
 import shutil
-import sys
 import tempfile
 import time
 import zlib
@@ -21,6 +20,8 @@ from pathlib import Path
 from platformdirs import user_cache_path, user_pictures_path, user_state_path
 
 from progdf.errors import ProgdfError
+from progdf.system.files import is_owned, replace_file
+from progdf.system.processes import is_running
 
 _DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -29,8 +30,6 @@ _TEMPORARY_NAME = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9
 _COMPLETE_SUFFIX = ".complete"  # ending of a `write_files_together` folder that is ready to move
 _ABANDONED_AFTER_S = 86400.0
 _DEVICE_NAME = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
-_IN_USE_ERRORS = (5, 32)  # Windows: ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION
-_RETRY_DELAYS_S = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 @contextmanager
@@ -187,25 +186,6 @@ def _temporary_path(folder: Path, suffix: str = "") -> Path:
     return folder / f".progdf-{_HOST_HASH}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
 
 
-def replace_file(path: Path, target: Path) -> None:
-    """Replace a file as `os.replace` does, with retries on Windows.
-
-    Windows refuses to replace a file that a process has open, even for reading or a virus scan.
-
-    Raises:
-        OSError: the target is still in use after two seconds, or the file cannot be moved.
-    """
-    for wait in _RETRY_DELAYS_S:
-        try:
-            os.replace(path, target)
-            return
-        except PermissionError as error:
-            if getattr(error, "winerror", None) not in _IN_USE_ERRORS:
-                raise
-        time.sleep(wait)
-    os.replace(path, target)
-
-
 def _create(path: Path, mode: int | None) -> None:
     """Create an empty file with the given permissions; None for the default ones.
 
@@ -268,15 +248,10 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _is_in_use(name: re.Match[str], entry: os.DirEntry[str]) -> bool:
-    if name["host"] != _HOST_HASH or sys.platform == "win32":
+    running = is_running(int(name["process"])) if name["host"] == _HOST_HASH else None
+    if running is None:
         return time.time() - entry.stat().st_mtime <= _ABANDONED_AFTER_S
-    try:
-        os.kill(int(name["process"]), 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True
+    return running
 
 
 def check_not_an_input(out: Path, inputs: Sequence[Path]) -> None:
@@ -429,19 +404,6 @@ def temporary_folder() -> Path:
     """Return a per-user folder for temporary files, used if the home folder is missing or read-only."""
     user = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
     return Path(tempfile.gettempdir()) / f"progdf-{user}"
-
-
-def is_owned(path: Path) -> bool:
-    """Return whether a file, folder or link itself belongs to the user (always True on Windows)."""
-    return sys.platform == "win32" or path.lstat().st_uid == os.getuid()
-
-
-def is_private(folder: Path) -> bool:
-    """Return whether only the user can write to a folder that is not a link (always True on Windows)."""
-    if sys.platform == "win32":
-        return True
-    status = folder.lstat()
-    return status.st_uid == os.getuid() and not folder.is_symlink() and not status.st_mode & 0o022
 
 
 def _or_temporary(path: Path) -> Path:

@@ -14,7 +14,7 @@ from typing import NoReturn
 import pytest
 
 from progdf.__main__ import main
-from progdf.terminal import handle_signals
+from progdf.system.processes import handle_signals
 from trainer.store.state import defer_signals, interrupt_on_signals
 
 pytestmark = [pytest.mark.skipif(os.name == "nt", reason="needs signals that wake the main thread")]

@@ -27,7 +27,7 @@ from progdf.gdf.file import load_gdf
 from progdf.io.atomic import LOCK, atomic_write, hold_lock, is_locked
 from progdf.io.images import to_picture
 from progdf.rasterize import render
-from progdf.terminal import signal_main_thread
+from progdf.system.processes import signal_main_thread
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
 from trainer.run.command import check_command, select_region

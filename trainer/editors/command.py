@@ -13,13 +13,10 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import BoundedSemaphore, Lock
@@ -30,6 +27,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import read_picture, write_image
+from progdf.system.processes import kill_group
 from progdf.terminal import escape_text, format_duration
 from trainer.options import EditKind, EditorOptions
 from trainer.store.run_folder import from_bytes, to_bytes
@@ -171,7 +169,7 @@ class Programs:
             try:
                 status = process.wait(timeout)
             except subprocess.TimeoutExpired as error:
-                end_group(process)
+                _end(process)
                 raise CallFailedError(
                     f"it takes more than {timeout:g} seconds; allow more with --edit-timeout"
                 ) from error
@@ -203,19 +201,12 @@ class Programs:
         with self._lock:
             self.stopped = True
             for process in self._running:
-                end_group(process)
+                _end(process)
 
 
-def end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a running program that heads a group, and all programs that it started."""
-    if process.poll() is not None:
-        return
-    if sys.platform == "win32":
-        command = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
-        subprocess.run(command, capture_output=True, check=False)
-    else:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a running program and all programs that it started, and wait for its end."""
+    kill_group(process)
     process.wait()
 
 

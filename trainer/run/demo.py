@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, read_picture, to_picture, write_image
 from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
+from progdf.system.desktop import has_display
 from progdf.terminal import print_line
 from trainer.options import (
     LARGEST_SEED,
@@ -177,7 +177,7 @@ def main(argv: Sequence[str]) -> int:
     print(f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:")
     print_line(f"  progdf {shlex.join(command)}")
     sys.stdout.flush()
-    if options.window and _display_available():
+    if options.window and has_display():
         return _open_window(command)
     return 0
 
@@ -321,9 +321,3 @@ def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -
 
 def _gdf_path(folder: Path, edit: DemoEdit) -> Path:
     return folder / edit.name / f"{edit.name}.gdf"
-
-
-def _display_available() -> bool:
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

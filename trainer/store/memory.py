@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
-from pathlib import Path
+from progdf.system.processes import c_library, resident_bytes
 
 LARGEST_REUSED_BLOCK = 1 << 28
 """Largest block that is reused, bytes."""
@@ -15,7 +13,7 @@ KEPT_MEMORY = 1 << 29
 _MMAP_THRESHOLD = -3  # M_MMAP_THRESHOLD of glibc
 _TRIM_THRESHOLD = -1  # M_TRIM_THRESHOLD of glibc
 
-_GLIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_GLIBC = c_library()
 _MALLOPT = getattr(_GLIBC, "mallopt", None)
 _MALLOC_TRIM = getattr(_GLIBC, "malloc_trim", None)
 
@@ -38,13 +36,9 @@ def release_memory() -> None:
     glibc keeps freed blocks that lie between used ones: 0.8 GB after the views of 200 000 members.
     """
     global _resident
-    if _MALLOC_TRIM is not None and _resident_pages() > 1.1 * _resident:
+    if _MALLOC_TRIM is not None and resident_bytes() > 1.1 * _resident:
         _MALLOC_TRIM(0)
-        _resident = _resident_pages()
+        _resident = resident_bytes()
 
 
-_resident = 0  # pages after the last `release_memory`
-
-
-def _resident_pages() -> int:
-    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+_resident = 0  # bytes after the last `release_memory`

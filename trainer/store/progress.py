@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import write_file
+from progdf.system.processes import peak_mb
 from progdf.terminal import escape_text
 
 from .memory import release_memory
@@ -263,23 +263,3 @@ class RunLog:
 
 def _escape(text: str) -> str:
     return escape_text(text).replace("[", "\\[")
-
-
-_STATUS_FILE = Path("/proc/self/status")
-
-
-def peak_mb() -> float:
-    """Return the peak resident memory of the process (VmHWM), MB of 2²⁰ bytes; 0 if unknown.
-
-    `getrusage` is not used on Linux: its figure starts at the parent's memory when this process was started.
-    """
-    if sys.platform == "win32":
-        return 0.0
-    if sys.platform == "linux":
-        for line in _STATUS_FILE.read_text(encoding="ascii", errors="replace").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)

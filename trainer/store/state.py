@@ -11,10 +11,8 @@ complete one. No file is ever executed. Without run.json there is nothing to res
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -32,7 +30,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
-from progdf.terminal import ENDINGS, handle_signals
+from progdf.system.files import flush_to_disk
+from progdf.system.processes import ENDINGS, handle_signals
 
 
 @contextmanager
@@ -149,7 +148,7 @@ class StateFolder:
             temporary_file.write_text(
                 json.dumps(identity, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
             )
-            _flush(temporary_file)
+            flush_to_disk(temporary_file)
 
     def save(
         self, part: str, tensors: Mapping[str, Tensor], values: Mapping[str, Any], index: int | None = None
@@ -187,7 +186,7 @@ class StateFolder:
                 path.parent.mkdir(exist_ok=True)
             with atomic_write(path) as temporary_file:
                 write_tensors(temporary_file, tensors, header)
-                _flush(temporary_file)
+                flush_to_disk(temporary_file)
             return time.perf_counter() - begun
 
         _writing[self.path] = _writer().submit(write)
@@ -340,12 +339,3 @@ def generator(state: Tensor) -> torch.Generator:
     restored = torch.Generator()
     restored.set_state(state)
     return restored
-
-
-def _flush(path: Path) -> None:
-    """Flush a file to the disk, as must be done before it is renamed."""
-    handle = os.open(path, os.O_RDONLY if sys.platform != "win32" else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

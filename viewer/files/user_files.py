@@ -6,8 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -209,19 +207,6 @@ def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
 def _thumbnail(path: Path) -> Path:
     digest = hashlib.sha256(str(path.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
     return state_folder() / "thumbnails" / f"{digest}.png"
-
-
-def open_in_program(path: Path) -> bool:
-    """Open a file in the desktop's default program. Return False if the desktop provides no launcher."""
-    try:
-        if sys.platform == "win32":
-            os.startfile(path, "edit")
-        else:
-            command = "open" if sys.platform == "darwin" else "xdg-open"
-            subprocess.Popen([command, str(path)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    except OSError:
-        return False
-    return True
 
 
 def parse_path(text: str) -> Path:

@@ -19,11 +19,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import IO, Annotated
 
 from msgspec import Meta
 
-from progdf.terminal import lower_priority, signal_main_thread
+from progdf.system.processes import child_options, kill_group, lower_priority, signal_main_thread
 
 GRACE_S = 8.0
 """Seconds between a stop request and the kill; the child may be saving its state."""
@@ -60,10 +60,6 @@ class Child:
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
-        options: dict[str, Any] = {"process_group": 0}
-        if sys.platform == "win32":
-            flags = 0 if talks else subprocess.BELOW_NORMAL_PRIORITY_CLASS
-            options = {"creationflags": flags | subprocess.CREATE_NEW_PROCESS_GROUP}
         if talks:
             arguments = [_TALKS, *arguments]
         with log.open("wb") as sink:
@@ -74,7 +70,7 @@ class Child:
                 stdout=subprocess.PIPE if talks else sink,
                 stderr=sink if talks else subprocess.STDOUT,
                 env={**os.environ, "NO_COLOR": "1", "COLUMNS": "4096"},
-                **options,
+                **child_options(low_priority=not talks),
             )
         if not talks:
             lower_priority(self._process.pid)
@@ -119,11 +115,7 @@ class Child:
 
     def kill(self) -> None:
         """Kill the command and all its child processes at once."""
-        with contextlib.suppress(OSError):
-            if sys.platform != "win32" and hasattr(os, "killpg"):
-                os.killpg(self._process.pid, signal.SIGKILL)
-            else:
-                self._process.kill()
+        kill_group(self._process)
 
     def close(self) -> None:
         """Stop the command and wait until it has ended.

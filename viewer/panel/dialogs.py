@@ -7,8 +7,6 @@ until the file is saved; then the file actions close it.
 from __future__ import annotations
 
 import os
-import shutil
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +14,7 @@ from pathlib import Path
 from imgui_bundle import imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as dialogs
 
+from progdf.system.desktop import has_file_dialog
 from progdf.terminal import escape_text
 from viewer.files.user_files import complete_path, path_completions
 from viewer.state.commands import Action, OnItem, Plain, RebindEdit, ReplaceEdit, Save, WithText
@@ -385,7 +384,7 @@ _SAVE = ["Sessions", "*.json", "All files", "*"]
 
 def obstacle() -> str:
     """Return the reason why no system file dialog can be shown, in one line; "" if one can."""
-    if sys.platform in ("win32", "darwin") or any(shutil.which(program) for program in PROGRAMS):
+    if has_file_dialog(PROGRAMS):
         return ""
     return f"No file dialog is installed ({PROGRAMS[0]} or {PROGRAMS[1]}); type the path"
 

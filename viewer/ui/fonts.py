@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -11,6 +10,8 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 from PIL import ImageFont
+
+from progdf.system.desktop import font_folders
 
 from .splash import FONTS, REGULAR, TEXT_PX
 
@@ -96,18 +97,6 @@ def missing_message(characters: str) -> str:
     codes = ", ".join(f"U+{ord(c):04X}" for c in characters[:3])
     more = " …" if len(characters) > 3 else ""
     return f"No installed font has {codes}{more} of the names here. Install Noto Sans CJK and restart."
-
-
-def font_folders() -> tuple[Path, ...]:
-    """Return the folders in which the system installs fonts."""
-    if sys.platform == "win32":
-        local = os.environ.get("LOCALAPPDATA", "")
-        folders = (os.path.join(os.environ.get("WINDIR", "C:\\Windows"), "Fonts"),)
-        return tuple(map(Path, (*folders, os.path.join(local, "Microsoft", "Windows", "Fonts"))))
-    if sys.platform == "darwin":
-        return tuple(map(Path, ("/System/Library/Fonts", "/Library/Fonts", "~/Library/Fonts")))
-    shared = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
-    return tuple(map(Path, (f"{shared}/fonts", "~/.fonts", "/usr/local/share/fonts", "/usr/share/fonts")))
 
 
 @cache

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import sys
 from pathlib import Path
 
+from progdf.system.desktop import glfw_library_name
+
 BUNDLE = Path(getattr(importlib.util.find_spec("imgui_bundle"), "origin", "")).parent
-_LIBRARY = BUNDLE / {"darwin": "libglfw.3.dylib", "win32": "glfw3.dll"}.get(sys.platform, "libglfw.so.3")
+_LIBRARY = BUNDLE / glfw_library_name()
 if _LIBRARY.exists():  # same setting as the import of imgui_bundle
     os.environ.setdefault("PYGLFW_LIBRARY", str(_LIBRARY))
 

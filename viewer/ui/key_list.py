@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 
 from imgui_bundle import imgui, imgui_ctx
 
+from progdf.system.desktop import has_command_key
 from viewer.state.commands import Action, Plain
 
 from .context import FIXED, PALETTE, SMALL_PX, Icon, UiContext
@@ -60,7 +60,7 @@ class Topic:
 
 def topics() -> tuple[Topic, ...]:
     """Return all commands by topic, each once."""
-    mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
+    mouse = Topic("Mouse", MOUSE_HELP + (_MAC if has_command_key() else ()))
     return mouse, *(Topic(name, tuple(dict.fromkeys(_lines(commands)))) for name, commands in TOPICS.items())
 
 

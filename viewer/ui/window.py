@@ -6,7 +6,6 @@ import ctypes
 import math
 import signal
 import socket
-import sys
 import threading
 import time
 from collections import deque
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from imgui_bundle import imgui
+
+from progdf.system.desktop import has_command_key
 
 from .glfw_library import glfw
 from .keys import FLY_KEYS, Keys, Press, end_frame_here, has_pending_input, next_event_id
@@ -296,6 +297,6 @@ def key_name(key: int, scancode: int) -> str:
 
 def chord(name: str, mods: int) -> str:
     """Return a key with its modifiers, in the form of `keys.KEYS`; on a Mac, Command counts as Ctrl."""
-    ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
+    ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if has_command_key() else 0)
     modifiers = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
     return "".join(prefix for prefix, bit in modifiers if mods & bit) + name

@@ -26,7 +26,8 @@ from typing import Any, TypeVar
 from filelock import FileLock
 
 from progdf.errors import ProgdfError, is_out_of_memory
-from progdf.io.atomic import cache_folder, is_private, temporary_folder
+from progdf.io.atomic import cache_folder, temporary_folder
+from progdf.system.files import is_private
 
 try:
     import numba

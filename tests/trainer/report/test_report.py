@@ -152,7 +152,7 @@ def test_wide_legend_continues_in_a_second_row() -> None:
 PEAKS = """
 import resource
 from pathlib import Path
-from trainer.store.progress import peak_mb
+from progdf.system.processes import peak_mb
 block = bytearray(128 << 20)
 large = peak_mb()
 del block

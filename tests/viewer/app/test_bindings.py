@@ -383,13 +383,3 @@ def test_command_key_acts_as_ctrl_on_a_mac(
     assert window.chord("S", both) == window.chord("S", window.glfw.MOD_CONTROL | window.glfw.MOD_SHIFT)
     assert window.chord("S", both) == "Ctrl+Shift+S"
     assert any("Cmd" in row for topic in key_list.topics() for row in topic.rows)
-
-
-def test_window_requests_the_gl_context_that_macs_support() -> None:
-    from viewer.ui import splash
-
-    hints = dict(splash._HINTS)
-    glfw = splash.glfw
-    assert (hints[glfw.CONTEXT_VERSION_MAJOR], hints[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
-    assert hints[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
-    assert hints[glfw.OPENGL_FORWARD_COMPAT]

@@ -23,7 +23,6 @@ from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
 from viewer.app.parts import preview
 from viewer.camera.view_camera import to_camera
-from viewer.files import user_files
 from viewer.files.session import open_session
 from viewer.jobs import job_queue, preview_process
 from viewer.state.commands import OnItem, Plain
@@ -299,7 +298,7 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = list[Path]()
-    monkeypatch.setattr(user_files, "open_in_program", lambda path: given.append(path) or True)
+    monkeypatch.setattr("viewer.app.parts.preview.open_in_program", lambda path: given.append(path) or True)
     pytest.importorskip("diffusers", reason="pip install progdf-studio[diffusion]")
     Previews.grade = None
     opened(window)

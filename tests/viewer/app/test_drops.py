@@ -22,7 +22,7 @@ from progdf.io.picture_camera import camera_chunk, layers_in_picture
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import exports, user_files
+from viewer.files import exports
 from viewer.pictures.film import to_pixels
 from viewer.state import selection
 from viewer.state.commands import Plain, ReplaceEdit
@@ -122,7 +122,7 @@ def test_painting_over_saves_the_visible_layers_and_their_strengths(
 ) -> None:
     painted = list[Path]()
     with_files(opened, tmp_path)
-    monkeypatch.setattr(user_files, "open_in_program", lambda path: painted.append(path) or True)
+    monkeypatch.setattr("viewer.app.parts.preview.open_in_program", lambda path: painted.append(path) or True)
     view = opened.main_view.work.view
     layers = (replace(view.layers[0], strength=0.6, gains=Gains(color=0.5)),)
     opened.main_view.store.change(replace(view, layers=layers))
@@ -151,7 +151,9 @@ def test_painting_over_saves_the_visible_layers_and_their_strengths(
 def test_layer_without_a_file_must_be_hidden_before_painting_over(
     opened: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(user_files, "open_in_program", lambda _: pytest.fail("nothing was saved"))
+    monkeypatch.setattr(
+        "viewer.app.parts.preview.open_in_program", lambda _: pytest.fail("nothing was saved")
+    )
     with_files(opened, tmp_path)
     opened.documents.replace(replace(opened.documents.get(), gdf_paths=()))
     opened.handle(Plain("paint_view"))

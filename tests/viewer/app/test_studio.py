@@ -31,7 +31,7 @@ from trainer.store.run_folder import RunFolder
 from viewer.app import app as application
 from viewer.app.parts.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera, to_camera
-from viewer.files import region_files, user_files
+from viewer.files import region_files
 from viewer.files.document import empty
 from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
@@ -355,7 +355,7 @@ def test_view_painted_in_another_program_is_shown_on_every_save(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened = list[Path]()
-    monkeypatch.setattr(user_files, "open_in_program", lambda path: opened.append(path) or True)
+    monkeypatch.setattr("viewer.app.parts.preview.open_in_program", lambda path: opened.append(path) or True)
     press(window, "Ctrl+N")
     request(window, Plain("paint_view"))
     (path,) = opened

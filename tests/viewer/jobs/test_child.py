@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from progdf.terminal import NICENESS
+from progdf.system.processes import NICENESS
 from trainer.run import demo
 from viewer.jobs.child import Child
 

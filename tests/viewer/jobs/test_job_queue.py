@@ -27,7 +27,7 @@ PATIENCE_S = 600.0
 @pytest.fixture(autouse=True)
 def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run children at normal priority. On a busy machine low priority takes ten times as long."""
-    monkeypatch.setattr("progdf.terminal.NICENESS", 0)
+    monkeypatch.setattr("progdf.system.processes.NICENESS", 0)
 
 
 class Waiting:

@@ -75,7 +75,7 @@ def test_saving_takes_at_most_one_percent_of_the_time(
 
 def test_training_continues_while_a_slow_disk_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flushed, rows = threading.Event(), torch.ones(3)
-    monkeypatch.setattr("trainer.store.state._flush", lambda path: flushed.wait(60.0))
+    monkeypatch.setattr("trainer.store.state.flush_to_disk", lambda path: flushed.wait(60.0))
     folder = StateFolder(tmp_path / "state")
     folder.path.mkdir()
 

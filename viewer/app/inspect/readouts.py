@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections import deque
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from imgui_bundle import imgui, imgui_ctx
 from numpy.typing import NDArray
 
+from progdf.system.processes import resident_bytes
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, PixelGaussians, outlines, seen_at
 from viewer.render.properties import Distribution, distribution
 from viewer.render.view_modes import CONTRIBUTION, visible_count
@@ -117,11 +116,8 @@ class Distributions:
 
 def memory() -> str:
     """Return the memory of the process as text; "" where the system does not report it."""
-    if not sys.platform.startswith("linux"):
-        return ""
-    fields = Path("/proc/self/status").read_text("ascii", "replace").splitlines()
-    kilobytes = next((line.split()[1] for line in fields if line.startswith("VmRSS:")), "")
-    return f"{int(kilobytes) / 1e6:.1f} GB" if kilobytes else ""
+    resident = resident_bytes()
+    return f"{resident / 1e9:.1f} GB" if resident else ""
 
 
 def _probe(key: object, pointer: PointerContext) -> _Probe:

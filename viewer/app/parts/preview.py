@@ -22,6 +22,7 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.images import open_picture
 from progdf.io.picture_camera import find_picture_camera
+from progdf.system.desktop import open_in_program
 from viewer.app.grading import GradePreview
 from viewer.app.messages import Messages, Requests, error_line
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
@@ -261,7 +262,7 @@ class PreviewActions:
     ) -> None:
         self._painting = PreviewedView(path, camera, size, _file_state(path))
         self._show(PAINT_TEXT, cover)
-        if not user_files.open_in_program(path):
+        if not open_in_program(path):
             self._messages.show(f"No program for pictures was found. Open {path} in yours.")
 
     def _is_painting(self, painted: PreviewedView) -> bool:
