@@ -11,10 +11,20 @@ from pathlib import Path
 
 
 def has_display() -> bool:
-    """Return whether a window may open: on Linux, whether the environment names a display."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    """Return whether a window may open: on Linux, whether the environment names an X11 display.
+
+    Wayland desktops name one, too, that of XWayland. The interface's glfw library speaks X11 only.
+    """
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY"))
+
+
+def display_remedy() -> str:
+    """Return how to get a display where `has_display` is False, as a part of a message; "" elsewhere."""
+    if has_display():
+        return ""
+    if os.environ.get("WAYLAND_DISPLAY"):
+        return "install XWayland (package xwayland) and log in again, as the window needs X11"
+    return "log in to a desktop, or connect with ssh -X"
 
 
 def has_file_dialog(programs: Sequence[str]) -> bool:

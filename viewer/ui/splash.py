@@ -13,6 +13,7 @@ import moderngl
 from PIL import Image, ImageDraw, ImageFont
 
 from progdf.errors import ProgdfError
+from progdf.system.desktop import display_remedy
 from viewer.gl.programs import load_program
 
 from .glfw_library import BUNDLE, glfw
@@ -173,7 +174,8 @@ class _GlfwLoader:
 
 def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
     why = f" ({errors[-1]})" if errors else ""
-    return ProgdfError(f"{what}{why}; `progdf render` works without a window")
+    remedy = f"; {display_remedy()}" if display_remedy() else ""
+    return ProgdfError(f"{what}{why}{remedy}; `progdf render` and `progdf export` work without a window")
 
 
 def _decode(text: str | bytes) -> str:

@@ -40,8 +40,12 @@ def test_display_is_asked_for_on_linux_only(system: str, monkeypatch: pytest.Mon
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     assert desktop.has_display() == (system != "linux")
+    assert ("ssh -X" in desktop.display_remedy()) == (system == "linux")
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-1")
+    assert ("xwayland" in desktop.display_remedy()) == (system == "linux")
+    monkeypatch.setenv("DISPLAY", ":1")
     assert desktop.has_display()
+    assert desktop.display_remedy() == ""
 
 
 def test_file_dialogs_need_a_program_on_linux_only(system: str) -> None:
