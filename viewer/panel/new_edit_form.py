@@ -281,7 +281,7 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
         pressed = imgui.button("Again" if form.asks else first, imgui.ImVec2(half, 0.0))
         if pressed and not form.choice.is_outside:
             form = replace(form, asks=form.asks + 1, anchor="")
-    tip("Paint this view. All views will follow the picture; without one, they follow the front view")
+    tip("Edit this view. All views will follow the picture; without one, they follow the front view")
     imgui.same_line()
     with inert(not preview.painted):
         action = "paint_over" if imgui.button("Paint over", imgui.ImVec2(half, 0.0)) else ""

@@ -122,6 +122,13 @@ def test_program_runs_only_after_a_confirmation(window: application.App, tmp_pat
     assert f"--editor=command:{program}" in Trainer.said
 
 
+def test_unfinished_preview_of_another_editor_leaves_the_test_button_enabled(window: application.App) -> None:
+    fill(window, "recolor")
+    until(window, lambda: window.main_view.work.transient.preview.busy)
+    fill(window, "command", outside=OutsideSettings(program="convert {input} {output}"))
+    assert not window.main_view.work.transient.preview.busy
+
+
 def test_settings_of_servers_stay_when_another_scene_opens(window: application.App) -> None:
     outside = OutsideSettings(comfy="http://127.0.0.1:8188", workflow=str(WORKFLOW))
     fill(window, "comfy", outside=outside)

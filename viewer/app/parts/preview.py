@@ -572,11 +572,11 @@ class PreviewActions:
         """Set the picture over the view and the preview's state in the form."""
         work = self._store.get()
         available_models = work.transient.preview.models if models is None else models
-        painted = self._painted is not None and self._painted[0] == self._request()
+        request = self._request()
+        painted = self._painted is not None and self._painted[0] == request
+        busy = self._outstanding and request is not None  # answers for an earlier form keep nobody waiting
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
-        state = PreviewState(
-            text, failed, self._outstanding, painted, available_models, sheet, self._drawn, near
-        )
+        state = PreviewState(text, failed, busy, painted, available_models, sheet, self._drawn, near)
         if (work.transient.cover, work.transient.preview) != (cover, state):
             self._store.replace(with_transient(work, cover=cover, preview=state))
             self._store.wake()
