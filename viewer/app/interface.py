@@ -192,7 +192,7 @@ def _draw_question(work: Workspace, pointer: PointerContext) -> Workspace:
     area = pointer.area
     edge = tools.EDGE_PX * ui.scale
     is_narrow = area.width < tools.NARROW_PX * ui.scale
-    bars = ("view", "view mode")
+    bars: tuple[str, ...] = ("view", "view mode")
     if is_narrow:
         bars += ("options", "placing", "comparison", "comparison note")
     above = [imgui.internal.find_window_by_name(name) for name in bars]

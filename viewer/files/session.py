@@ -31,7 +31,6 @@ from progdf.io.atomic import (
     is_locked,
     make_folder,
     numbered_names,
-    replace_file,
     state_folder,
 )
 from progdf.io.session import (
@@ -46,6 +45,7 @@ from progdf.io.session import (
 )
 from progdf.painting.strokes import unpack
 from progdf.region import Region, from_mask
+from progdf.system.files import replace_file
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
 from viewer.state import selection
