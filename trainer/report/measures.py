@@ -121,6 +121,7 @@ _ROUNDING_DIFFERENCE = 1.5 / 255  # color difference of two images due to roundi
 REPRODUCED_SHARE = 0.9
 """Share of the paint, 0 to 1, from which an edit of pictures counts as a success."""
 _PAINT_DIFFERENCE = 0.05  # color difference of a painted pixel if the file format is unknown, as in `changed`
+_COMPARED_ROWS = 1 << 16  # Gaussians that are compared at once, to copy little of a large scene
 _RECORDING_SAMPLES = 6  # recordings at which the field is compared
 CLIP_STRENGTHS = tuple(i / 10 for i in range(11))  # slider values of the CLIP curve
 
@@ -255,15 +256,23 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
     packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())
-    change = 0.0
-    for s in (0.3, 1.0):
-        edited = edited_scene(scene, gdf, s)
-        for name in ATTRIBUTES:
-            before = getattr(scene, name)[outside]
-            after = getattr(edited, name)[: len(scene)][outside]
-            if before.numel() and not torch.equal(before, after):
-                change = max(change, float((after - before).abs().max()))
+    change = _largest_change(scene, finished, outside)
+    del finished  # one copy of a large scene at a time
+    change = max(change, _largest_change(scene, edited_scene(scene, gdf, 0.3), outside))
     return endpoint, change
+
+
+def _largest_change(scene: Gaussians, edited: Gaussians, counted: Tensor) -> float:
+    """Return the largest difference of raw parameters, over the counted rows of the scene. [N] bool"""
+    largest = 0.0
+    for name in ATTRIBUTES:
+        before, after = getattr(scene, name), getattr(edited, name)
+        for begin in range(0, len(scene), _COMPARED_ROWS):
+            rows = slice(begin, min(begin + _COMPARED_ROWS, len(scene)))
+            difference = (after[rows] - before[rows])[counted[rows]]
+            if difference.numel():
+                largest = max(largest, float(difference.abs().max()))
+    return largest
 
 
 def delivered_figures(
