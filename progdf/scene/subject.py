@@ -26,6 +26,7 @@ from progdf.terminal import format_count
 
 from .bounds import front_direction, has_ceiling, has_long_tail, quantile
 from .neighbors import CellGrid, Neighborhood, typical_spacing
+from .orbit_rig import MIN_GAUSSIANS, OCCLUSION_SAMPLE, detailed_side, visible_points
 from .point_tree import PointTree
 from .scribbles import Rows
 from .selection import Mask
@@ -33,7 +34,6 @@ from .selection import Mask
 _log = logging.getLogger(__name__)
 
 _MAX_SAMPLED_ROWS = 60_000  # Gaussians; larger scenes are sampled evenly
-_MIN_GAUSSIANS = 64  # Gaussians; fewer do not define a shape
 _MIN_SOLID_OPACITY = 0.1  # opacity; less opaque Gaussians are haze
 _CORE_RADIUS = 2.5  # median distances from the middle; Gaussians farther away are background
 
@@ -46,10 +46,7 @@ _MAX_COVERED_CELLS = 0.6  # largest share of the plan's cells covered by Gaussia
 
 _GROUND_QUANTILE = 0.01  # share of a scene below its ground: strays, and the far side of soft surfaces
 
-_OCCLUSION_SAMPLE = 8_000  # Gaussians that are tested for occlusion
-
 _MIN_CLEARANCE = 0.2  # smallest distance of the eye to any Gaussian in a room, in half widths of the room
-_MIN_VISIBILITY_RATIO = 1.5  # a first picture leaves the front if another side shows this many times as much
 
 # Share of the largest object's cells; smaller objects are tufts or strays. The toy robot's hands fill 0.11 of
 # its body's, the largest tuft of its ground 0.03.
@@ -81,7 +78,7 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
     """
     rows = _sample(scene)
     solid = rows[scene.opacities[rows] > _MIN_SOLID_OPACITY]
-    if len(solid) < _MIN_GAUSSIANS:
+    if len(solid) < MIN_GAUSSIANS:
         return rows
     rows = _without_background(scene, solid)
     height, plan = _heights_and_plan(scene.means[rows], up)
@@ -160,7 +157,7 @@ def first_view(scene: Gaussians, up: Tensor, size: tuple[int, int]) -> Camera:
         K = intrinsics(math.radians(_ROOM_FOV_DEG), *size)
         return Camera(look_at(*room_viewpoint(scene, up), up), K, *size)
     subject = scene[subject_rows(scene, up)]
-    turn = _FIRST_AZIMUTH_DEG + best_azimuth_offset(subject, up, _FIRST_AZIMUTH_DEG, _FIRST_ELEVATION_DEG)
+    turn = _FIRST_AZIMUTH_DEG + detailed_side(subject, up, _FIRST_AZIMUTH_DEG, _FIRST_ELEVATION_DEG)
     fov = math.radians(_FIRST_FOV_DEG)
     return fit_camera(scene, up, (turn, _FIRST_ELEVATION_DEG), size, fov, _FIRST_FILLED)
 
@@ -238,7 +235,7 @@ def _solid_near_and_ground(scene: Gaussians, up: Tensor) -> tuple[Rows, Rows, tu
     """Return the solid rows of a sample, those without far background, and their `_split_ground`."""
     rows = _sample(scene)
     solid = rows[scene.opacities[rows] > _MIN_SOLID_OPACITY]
-    if len(solid) < _MIN_GAUSSIANS:
+    if len(solid) < MIN_GAUSSIANS:
         return rows.numpy(), rows.numpy(), None
     near = _without_background(scene, solid)
     parts = _split_ground(*_heights_and_plan(scene.means[near], up))
@@ -267,7 +264,7 @@ def _object_on_ground(
         _, cell_of_row, objects = CellGrid.around(places).find_objects(places)
         groups = objects[cell_of_row].numpy()
         standing = standing[groups == np.bincount(groups, in_middle[standing]).argmax()]
-        if supports == _MAX_SUPPORTS or len(standing) < _MIN_GAUSSIANS:
+        if supports == _MAX_SUPPORTS or len(standing) < MIN_GAUSSIANS:
             break
         parts = _split_support(*_heights_and_plan(scene.means[standing], up))
         if parts is None:
@@ -292,7 +289,7 @@ def _object_and_floaters(scene: Gaussians, solid: Rows, in_middle: NDArray[np.fl
         in_middle: visible weight of each Gaussian in the middle of the view. [N]
     """
     places = scene.means[solid]
-    if len(solid) < _MIN_GAUSSIANS:
+    if len(solid) < MIN_GAUSSIANS:
         return solid, np.zeros(0, np.int64)
     grid = CellGrid.around(places, typical_spacing(places))
     _, cell_of_row, objects = grid.find_objects(places)
@@ -324,7 +321,7 @@ def _split_support(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None
     covered = _covered_cells(cell[above])
     around = binary_dilation(covered, np.ones((3, 3))) & ~covered
     is_support = (
-        int(above.sum()) >= _MIN_GAUSSIANS
+        int(above.sum()) >= MIN_GAUSSIANS
         and covered.sum() <= _MAX_COVERED_CELLS * wide.sum()
         and (wide & around).sum() >= _MIN_RIM_SHARE * around.sum()
     )
@@ -418,7 +415,7 @@ def room_viewpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     low, high = (torch.stack([quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
     center = 0.5 * (low + high)
     half = 0.5 * (high - low)
-    sampled = inside[:: -(-len(inside) // _OCCLUSION_SAMPLE)]
+    sampled = inside[:: -(-len(inside) // OCCLUSION_SAMPLE)]
     clearance = _MIN_CLEARANCE * float(half[:2].min())
     best_score = -1.0
     view = (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
@@ -428,61 +425,12 @@ def room_viewpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
         for turn in range(12):
             angle = math.radians(30 * turn)
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
-            seen = _visible_points(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(is_free)
+            seen = visible_points(sampled - candidate, back, wide=1.0).sum() / len(sampled) + float(is_free)
             if float(seen) > best_score:
                 best_score = float(seen)
                 view = (candidate, candidate - float(half[:2].min()) * back)
     eye, target = view
     return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
-
-
-def best_azimuth_offset(scene: Gaussians, up: Tensor, azimuth: float, elevation: float) -> float:
-    """Return the angle from an azimuth to the side that shows most of the subject, degrees.
-
-    It finds the side of subjects such as an alcove or a face, which are open or solid on one side only. It is
-    0 unless that side shows at least 1.5 times as much.
-
-    Args:
-        scene: Gaussians of the subject
-        up: world direction that is up. [3]
-        azimuth, elevation: direction of the eye, degrees, see `front_direction`
-    """
-    if len(scene) < _MIN_GAUSSIANS:
-        return 0.0
-    means = scene.means[:: -(-len(scene) // _OCCLUSION_SAMPLE)]
-    ahead = front_direction(up)
-    points = (means - means.median(dim=0).values) @ torch.stack([ahead, torch.linalg.cross(up, ahead), up]).T
-    above = math.radians(elevation)
-    shares = []
-    for turn in range(8):
-        around = math.radians(azimuth + 45 * turn)
-        level = math.cos(above)
-        back = torch.tensor([level * math.cos(around), level * math.sin(around), math.sin(above)])
-        shares.append(float(_visible_points(points, back).float().mean()))
-    best = max(range(8), key=lambda turn: shares[turn])
-    return 45.0 * ((best + 4) % 8 - 4) if shares[best] >= _MIN_VISIBILITY_RATIO * shares[0] else 0.0
-
-
-def _visible_points(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
-    """Return the points that are not occluded in a picture of 24 x 24 cells. [P,3] -> [P] bool
-
-    Args:
-        places: points with z up, relative to the eye, or to the middle for an orthographic picture
-        back: unit vector from the scene to the eye, not straight up. [3]
-        wide: tangent of half the field of view; 0 for an orthographic picture
-    """
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
-    x, y, depth = (places @ torch.stack([right, torch.linalg.cross(back, right), -back]).T).unbind(1)
-    size = float(quantile(places.norm(dim=1), 0.95).clamp_min(1e-12))
-    unit = wide * depth.clamp_min(1e-6 * size) if wide else torch.full_like(depth, size)
-    cells = [((c / unit + 1) * 12).floor() for c in (x, y)]
-    within = (depth > 0) if wide else torch.ones_like(depth, dtype=torch.bool)
-    for cell in cells:
-        within &= (cell >= 0) & (cell < 24)
-    index = (cells[0] * 24 + cells[1]).clamp(0, 575).long()
-    masked_depth = torch.where(within, depth, math.inf)
-    nearest = torch.full((576,), math.inf).scatter_reduce(0, index, masked_depth, "amin")
-    return within & (depth <= nearest[index] + 0.08 * size)
 
 
 def ground_height(scene: Gaussians, up: Tensor) -> float:
@@ -552,7 +500,7 @@ def _split_ground(height: Tensor, plan: Tensor) -> tuple[Tensor, Tensor] | None:
     standing = above > _STANDING_HEIGHT
     covered = torch.zeros(len(taken)).index_add(0, cell, standing.float()) > 0.1 * counts
     on_ground = (
-        int(standing.sum()) >= _MIN_GAUSSIANS
+        int(standing.sum()) >= MIN_GAUSSIANS
         and float((above < -_STANDING_HEIGHT).float().mean()) <= _MAX_SHARE_BELOW
         and float((above[lowest].abs() < _STANDING_HEIGHT).float().mean()) >= _MIN_GROUND_CELLS
         and float(covered.float().mean()) <= _MAX_COVERED_CELLS

@@ -22,7 +22,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.json_values import one_of
 from progdf.scene.bounds import front_direction, scene_sphere
-from progdf.scene.subject import best_azimuth_offset, fit_eye, is_room, room_viewpoint, subject_rows
+from progdf.scene.orbit_rig import detailed_side
+from progdf.scene.subject import fit_eye, is_room, room_viewpoint, subject_rows
 from progdf.scene.up_axis import find_up, up_from_json
 
 Vec3 = tuple[float, float, float]
@@ -356,7 +357,7 @@ def first_camera(
         eye_at, target = (tuple(at.tolist()) for at in room_viewpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
     subject = scene[subject_rows(scene, axis)]
-    azimuth = camera.azimuth + best_azimuth_offset(subject, axis, camera.azimuth, camera.elevation)
+    azimuth = camera.azimuth + detailed_side(subject, axis, camera.azimuth, camera.elevation)
     return fit(replace(camera, azimuth=azimuth), subject, aspect)
 
 

@@ -15,6 +15,7 @@ from progdf.demo_scenes import DemoScene
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.scene.bounds import front_direction, is_surrounding
+from progdf.scene.orbit_rig import detailed_side
 from progdf.scene.subject import fit_eye, is_room, room_viewpoint, subject_rows
 from progdf.scene.up_axis import AXES, axis_direction, guess_up
 from tests.helpers.demo_scenes import bear, room
@@ -240,3 +241,18 @@ def test_alcove_opens_from_its_open_side(open_side: float) -> None:
     scene = replace(random_gaussians(6000, scale=0.02), means=spots, logit_opacities=torch.full((6000,), 2.0))
     camera = first_camera(scene, up=(0.0, 1.0, 0.0))
     assert math.cos(math.radians(camera.azimuth)) * open_side > 0.3
+
+
+@pytest.mark.parametrize(("painted", "azimuth"), [(1.0, 90.0), (-1.0, -90.0), (0.0, 20.0)])
+def test_painted_side_of_a_plain_box_is_its_first_view(painted: float, azimuth: float) -> None:
+    draw = np.random.default_rng(0)
+    spots = torch.from_numpy(draw.uniform(-0.5, 0.5, (6000, 3))).float()
+    faces = torch.arange(6000) % 6
+    for face in range(6):
+        spots[faces == face, face // 2] = (-0.5, 0.5)[face % 2]
+    plain = random_gaussians(6000, scale=0.02)
+    on_side = (spots[:, 0] == 0.5 * painted)[:, None]
+    colors = torch.where(on_side, plain.sh0, torch.zeros(3))
+    bands = torch.zeros_like(plain.shN)
+    scene = replace(plain, means=spots, sh0=colors, shN=bands, logit_opacities=torch.full((6000,), 2.0))
+    assert abs(20.0 + detailed_side(scene, UP, 20.0, 15.0) - azimuth) <= 45.0 * abs(painted)
