@@ -1,8 +1,10 @@
 """Color grade: the settings of a photographer's color panel, their text, and their effect on colors.
 
-A grade is a function of color alone, the same for pixels, Gaussians and the lattice of a .cube file. Neutral
-settings return the colors bit for bit. Colors pass the controls in this order, see `progdf.color.tone`:
+Without clarity, a grade is a function of color alone, the same for pixels, Gaussians and the lattice of a
+.cube file. Neutral settings return the colors bit for bit. Colors pass the controls in this order, see
+`progdf.color.tone`:
 
+0. clarity, where the detail of each color is known (`progdf.color.clarity`)
 1. palette: each source color becomes its target (`shift_palette`), before anything else changes colors
 2. whites, blacks, highlights, shadows on the lightness, then exposure; nothing clips before exposure
 3. temperature and tint
@@ -24,6 +26,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 
 from . import tone
+from .clarity import clarify
 from .edits import ColorFunction, hex_color, number_of, parse_color
 from .oklab import STRAIGHT, color_path, fit_gamut, srgb_to_oklab
 from .palette import (
@@ -49,6 +52,7 @@ GRADE_RANGES: dict[str, tuple[float, float, float]] = {
     "tint": (-1.0, 1.0, 0.0),
     "vibrance": (-1.0, 1.0, 0.0),
     "saturation": (-1.0, 1.0, 0.0),
+    "clarity": (-1.0, 1.0, 0.0),
     "balance": (-1.0, 1.0, 0.0),
 }
 """Smallest, largest and neutral value of each slider of a grade. Exposure is in stops."""
@@ -96,6 +100,11 @@ class ColorGrade:
             and all(torch.equal(source, target) for source, target in self.palette)
             and all(x == y for curve in curves for x, y in curve)
         )
+
+    @property
+    def clarity(self) -> float:
+        """Share of each color's detail to add, −1 to 1."""
+        return self.values.get("clarity", 0.0)
 
     @property
     def has_wheels(self) -> bool:
@@ -253,17 +262,18 @@ def measure_grade(grade: ColorGrade, rgb: Tensor, weights: Tensor) -> ColorGrade
     return replace(grade, palette_shadings=shadings, palette_shades=shades)
 
 
-def grade_course(rgb: Tensor, grade: ColorGrade) -> ColorFunction:
+def grade_course(rgb: Tensor, grade: ColorGrade, detail: Tensor | None = None) -> ColorFunction:
     """Return the path from colors to those of `grade_fully`, straight in OKLab."""
-    return color_path(rgb, grade_fully(rgb, grade), STRAIGHT)
+    return color_path(rgb, grade_fully(rgb, grade, detail), STRAIGHT)
 
 
-def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
+def grade_fully(rgb: Tensor, grade: ColorGrade, detail: Tensor | None = None) -> Tensor:
     """Apply the controls of a grade, in the order of this module.
 
     Args:
         rgb: sRGB colors, 0 to 1. [...,3]
         grade: settings
+        detail: see `local_detail`; None: without clarity. [...]
 
     Returns:
         Graded sRGB colors, 0 to 1; the colors themselves, clamped, for a neutral grade. [...,3]
@@ -271,6 +281,8 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     inside = rgb.nan_to_num(0.0).clamp(0, 1)
     if grade.is_neutral:
         return inside
+    if detail is not None:
+        inside = clarify(inside, detail, grade.clarity)
     lab = srgb_to_oklab(inside)
     if any(not torch.equal(source, target) for source, target in grade.palette) or any(grade.palette_curves):
         sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))

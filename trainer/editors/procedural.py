@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.grade import grade_course, measure_grade, parse_grade
+from progdf.color.clarity import local_detail
+from progdf.color.grade import ColorGrade, grade_course, measure_grade, parse_grade
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -66,26 +67,15 @@ class ColorEditor(ProceduralEditor):
 
 
 @dataclass(frozen=True)
-class StripesEditor(ProceduralEditor):
-    """Editor that paints a pattern on the Gaussians and renders them: the same stripes in every view."""
+class MemberEditor(ProceduralEditor):
+    """Editor that changes the Gaussians' colors and renders them, so that all views show the same change."""
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64
-    pattern: Tensor  # stripe coverage of each member, 0..1. [M]
-    target: Tensor  # stripe color, sRGB 0..1. [3]
-    source: color.RegionColor  # measured color of the region
-    path: ColorPath = "bowed"  # see `bend_of`
 
+    @abstractmethod
     def paint(self, rgb: Tensor) -> color.ColorFunction:
-        """Return the members' colors [M,3] by strength.
-
-        The paint removes most of the original texture's contrast.
-        """
-        typical = self.source.color
-        flattened = torch.lerp(rgb, typical.expand_as(rgb), (_STRIPE_COVERAGE * self.pattern)[:, None])
-        painted = color.recolor_fully(flattened, self.target, self.source)
-        bend = bend_of(typical, self.target, self.path)
-        return lambda strength: interpolate_colors(rgb, painted, strength * self.pattern, bend)
+        """Return the members' colors [M,3] by strength, from those that a view shows. [M,3]"""
 
     def course(self, view: View) -> Callable[[float], Tensor]:
         """See `ProceduralEditor.course`. Only the region's box is rendered."""
@@ -107,6 +97,39 @@ class StripesEditor(ProceduralEditor):
             return view.blend(inside)
 
         return edit
+
+
+@dataclass(frozen=True)
+class ClarityEditor(MemberEditor):
+    """Editor of a grade with clarity, which depends on the surroundings of each Gaussian."""
+
+    grade: ColorGrade
+    detail: Tensor  # see `local_detail`. [M]
+
+    def paint(self, rgb: Tensor) -> color.ColorFunction:
+        """See `MemberEditor.paint`."""
+        return grade_course(rgb, self.grade, self.detail)
+
+
+@dataclass(frozen=True)
+class StripesEditor(MemberEditor):
+    """Editor that paints a pattern on the Gaussians: the same stripes in every view."""
+
+    pattern: Tensor  # stripe coverage of each member, 0..1. [M]
+    target: Tensor  # stripe color, sRGB 0..1. [3]
+    source: color.RegionColor  # measured color of the region
+    path: ColorPath = "bowed"  # see `bend_of`
+
+    def paint(self, rgb: Tensor) -> color.ColorFunction:
+        """Return the members' colors [M,3] by strength.
+
+        The paint removes most of the original texture's contrast.
+        """
+        typical = self.source.color
+        flattened = torch.lerp(rgb, typical.expand_as(rgb), (_STRIPE_COVERAGE * self.pattern)[:, None])
+        painted = color.recolor_fully(flattened, self.target, self.source)
+        bend = bend_of(typical, self.target, self.path)
+        return lambda strength: interpolate_colors(rgb, painted, strength * self.pattern, bend)
 
 
 @dataclass(frozen=True)
@@ -166,7 +189,7 @@ def night(given: EditorInput) -> ColorEditor:
     return ColorEditor(lambda rgb: color.night_course(rgb, stops))
 
 
-def grade(given: EditorInput) -> ColorEditor:
+def grade(given: EditorInput) -> ProceduralEditor:
     """Return the editor of `grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2` (see `parse_grade`)."""
     requested = parse_grade(given.what)
     if requested.palette:
@@ -178,6 +201,9 @@ def grade(given: EditorInput) -> ColorEditor:
                 names = [color.hex_color(shade.tolist()) for shade in oklab_to_srgb(shades)]
                 line = f"{line}; shades of the same surface move with it: {', '.join(names)}"
             given.say(line)
+    if requested.clarity:
+        members = given.region.members
+        return ClarityEditor(given.scene, members, requested, local_detail(given.scene, members))
     return ColorEditor(lambda rgb: grade_course(rgb, requested))
 
 

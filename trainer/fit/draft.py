@@ -20,7 +20,7 @@ from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.region import Region
 from trainer.editors import editor_row, make_editor
-from trainer.editors.procedural import edit_course
+from trainer.editors.procedural import ColorEditor, edit_course
 from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorMembers, ColorView, MapFit, fit_maps
 from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
 from trainer.views.setup import render_thumbnails
@@ -134,6 +134,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     fitted = views.fitted
     judged = views.judged
     editor = make_editor(options, views.scene, views.region, (), lambda: views.glances)
+    if not isinstance(editor, ColorEditor):
+        return None  # clarity depends on the neighbors of a Gaussian
     plain = tuple((i + 1) / MAX_STAGES for i in range(MAX_STAGES))
     strengths = equalized_strengths(editor, options.editor, [fitted.row], plain)
     targets = list(map(edit_course(editor, fitted.row), strengths))

@@ -174,7 +174,8 @@ class GradePreview:
         path = next(path for name in names if not (path := folder / f"{name}{SUFFIX}").exists())
         write_cube(path, grade_fully(lattice_colors(SIDE).float(), grade), path.stem, settings)
         self._looks = None
-        self._messages.show(f"Saved the look {look_name(path.stem)} as {path}")
+        note = "; other programs read it without clarity" if grade.clarity else ""
+        self._messages.show(f"Saved the look {look_name(path.stem)} as {path}{note}")
         self._store.wake()
 
     def _copy(self, index: int | None) -> None:

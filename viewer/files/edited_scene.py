@@ -90,6 +90,11 @@ def save_cube(out: Path, document: Document, view: ViewState) -> str:
     same = lattice_colors(side)
     table = same + state.gains.color * (mapped_lattice(form, state.strength, side) - same)
     write_cube(out, table, state.name)
-    parts = {"mask": form.mask is not None, "residual": len(form.residual), "paint": state.paint}
+    parts = {
+        "mask": form.mask is not None,
+        "residual": len(form.residual),
+        "clarity": "clarity=" in document.gdfs[state.gdf].instruction,
+        "paint": state.paint,
+    }
     left_out = "".join(f"; its {name} is left out" for name, part in parts.items() if part)
     return f"wrote {out}: {side}³ colors, {describe_strengths(view)}{left_out}"

@@ -68,9 +68,10 @@ _HELPS = {
     "tint": "From green to magenta light",
     "vibrance": "Chroma of weak colors",
     "saturation": "−1 is gray, 1 doubles the chroma",
+    "clarity": "Local contrast: −1 smooths, 1 doubles it; not part of .cube files",
     "balance": "−1: more tones are highlights; 1: more are shadows",
 }
-_LIGHT = ("exposure", "contrast", "highlights", "shadows", "whites", "blacks")
+_LIGHT = ("exposure", "contrast", "highlights", "shadows", "whites", "blacks", "clarity")
 _COLOR = ("temperature", "tint", "vibrance", "saturation")
 _NAMES = tuple(GRADE_RANGES)
 

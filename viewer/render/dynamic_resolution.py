@@ -205,7 +205,9 @@ class MovingGrade:
     """Grade of pictures during motion. It changes the colors of a picture's Gaussians, not the scene's."""
 
     rows: NDArray[np.int64]  # graded rows of the scene, ascending. [M]
-    apply: Callable[[torch.Tensor], torch.Tensor]  # returns graded colors of drawn ones. [P,3] -> [P,3]
+    # returns graded colors of drawn ones [P,3], with their detail [P] if any. -> [P,3]
+    apply: Callable[[torch.Tensor, torch.Tensor | None], torch.Tensor]
+    detail: Array | None = None  # detail of the rows, see `local_detail`. [M]
 
 
 class LiveScene:
@@ -231,7 +233,8 @@ class LiveScene:
         self._graded: tuple[Gaussians, NDArray[np.int64]] | None = None  # see `show_grade`
         self._holds_grade = False  # whether `drawn` has the graded colors
         self._cut: tuple[object, ActivatedGaussians] | None = None  # last cut with its inputs
-        self._shares: tuple[Pyramid, NDArray[np.int64], Array] | None = None  # see `_grade_cut`
+        # inputs, the grade, and the means of its rows and its detail in the pyramid, see `_grade_cut`
+        self._means: tuple[object, MovingGrade, Array, Array | None] | None = None
         self._highlights: Array | None = None  # rgb and share, 0 to 1; None for no highlights. [N,4]
         self._budget = BUDGETS[1]
         self._finest = ERROR_LIMITS_PX2[1]  # error limit of the next picture in motion, pixels²
@@ -375,10 +378,21 @@ class LiveScene:
         grade = self.moving_grade
         if grade is None:
             return fewer
-        if self._shares is None or self._shares[0] is not pyramid or self._shares[1] is not grade.rows:
-            self._shares = pyramid, grade.rows, pyramid.shares_of(grade.rows)
-        share = torch.from_numpy(self._shares[2][pyramid.picks])[:, None]
-        return fewer._replace(colors=torch.lerp(fewer.colors, grade.apply(fewer.colors), share))
+        inputs = (id(pyramid), id(grade.rows), id(grade.detail))
+        if self._means is None or self._means[0] != inputs:
+            values = np.zeros((2, len(self.drawn.means)), np.float32)
+            values[0, grade.rows] = 1.0
+            shares = pyramid.means_of(values[0])
+            details = None
+            if grade.detail is not None:
+                values[1, grade.rows] = grade.detail
+                details = pyramid.means_of(values[1])
+            self._means = inputs, grade, shares, details
+        _, _, shares, details = self._means
+        share = torch.from_numpy(shares[pyramid.picks])[:, None]
+        detail = None if details is None else torch.from_numpy(details[pyramid.picks])
+        graded = grade.apply(fewer.colors, detail)
+        return fewer._replace(colors=torch.lerp(fewer.colors, graded, share))
 
     def measure(self, moving: Array, full: Array) -> None:
         """Measure the error limit that gives `FINE_ERROR`.

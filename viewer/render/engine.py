@@ -304,7 +304,11 @@ class ViewEngine:
         Pictures during motion are graded by themselves, see `MovingGrade`. Before they can be, they have the
         colors of full pictures, from the last position.
         """
-        moving = None if live is None else MovingGrade(live.rows, partial(self._live_colors.recolor, live))
+        version = (self._edits, self.composer)
+        moving = None
+        if live is not None:
+            detail = self._live_colors.detail(self.composer.gaussians, live, version)
+            moving = MovingGrade(live.rows, partial(self._live_colors.recolor, live), detail)
         if self.renderer.grade_motion(moving) and is_coarse:
             return 0.0
         if live is None and self._graded is None:
@@ -321,7 +325,6 @@ class ViewEngine:
         elif last is not None and last[0] == inputs and last[1] == live:
             return 0.0
         if live is not None:
-            version = (self._edits, self.composer)
             graded = self._live_colors.apply(self.composer.gaussians, live, camera, version)
             self.renderer.show_grade(graded, live.rows)
             self._graded = inputs, live

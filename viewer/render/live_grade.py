@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.color.clarity import clarify, local_detail
 from progdf.color.grade import ColorGrade, grade_course, grade_fully, measure_grade, parse_grade
 from progdf.color.oklab import STRAIGHT, color_path
 from progdf.errors import ProgdfError
@@ -86,14 +87,25 @@ class ColorTable:
             points = used_points(self._inside)
             self._points = points if len(points) < len(colors) else None
 
-    def apply(self, live: LiveGrade) -> Tensor:
-        """Return the colors after the grade: exact for few, from the lattice for many. [M,3]"""
+    def apply(self, live: LiveGrade, detail: Tensor | None = None) -> Tensor:
+        """Return the colors after the grade: exact for few, from the lattice for many. [M,3]
+
+        Args:
+            live: the grade
+            detail: detail of the colors, for clarity; None for none. [M]
+        """
+        clarity = live.grade.clarity if detail is not None and live.table is None else 0.0
         if self._points is None:
-            graded = _at_strength(self._inside, live)
+            graded = _at_strength(self._inside, live, detail if clarity else None)
         else:
+            inside = self._inside
+            points = self._points
+            if detail is not None and clarity:
+                inside = clarify(inside, detail, clarity * live.strength)
+                points = used_points(inside)
             table = lattice_colors(SIDE).float()
-            table[self._points] = _at_strength(table[self._points], live)
-            graded = look_up(self._inside.T, table).T
+            table[points] = _at_strength(table[points], live)
+            graded = look_up(inside.T, table).T
         if live.marks:
             white, black = clipped_colors(graded)
             graded = graded.clone()
@@ -102,15 +114,15 @@ class ColorTable:
         return graded
 
 
-def _at_strength(colors: Tensor, live: LiveGrade) -> Tensor:
+def _at_strength(colors: Tensor, live: LiveGrade, detail: Tensor | None = None) -> Tensor:
     """Return the colors at the strength of the grade. [...,3] -> [...,3]"""
     if live.table is not None:
         flat = colors.reshape(-1, 3)
         full = look_up(flat.T, live.table).T.reshape(colors.shape).clamp(0.0, 1.0)
         return color_path(colors, full, STRAIGHT)(live.strength)
     if live.strength == 1.0:
-        return grade_fully(colors, live.grade)
-    return grade_course(colors, live.grade)(live.strength)
+        return grade_fully(colors, live.grade, detail)
+    return grade_course(colors, live.grade, detail)(live.strength)
 
 
 def used_points(colors: Tensor) -> Tensor:
@@ -131,12 +143,29 @@ class LiveColors:
         self._key: object = None
         self._table: ColorTable | None = None
         self._moving: ColorTable | None = None
+        self._detail: tuple[object, NDArray[np.int64], NDArray[np.float32]] | None = None
 
-    def recolor(self, live: LiveGrade, colors: Tensor) -> Tensor:
+    def detail(self, scene: Gaussians, live: LiveGrade, version: object) -> NDArray[np.float32] | None:
+        """Return the detail of the grade's rows, measured once per region; None without clarity. [M]
+
+        Args:
+            scene: composed scene
+            live: the grade
+            version: changes whenever the colors of `scene` do
+        """
+        if not live.grade.clarity:
+            return None
+        kept = self._detail
+        if kept is None or kept[0] != version or kept[1] is not live.rows:
+            measured = local_detail(scene, torch.from_numpy(live.rows)).numpy()
+            kept = self._detail = version, live.rows, measured
+        return kept[2]
+
+    def recolor(self, live: LiveGrade, colors: Tensor, detail: Tensor | None) -> Tensor:
         """Return the graded colors of a picture during motion. [P,3] -> [P,3]"""
         if self._moving is None or self._moving.colors is not colors:
             self._moving = ColorTable(colors, is_exact=False)
-        return self._moving.apply(live)
+        return self._moving.apply(live, detail)
 
     def apply(self, scene: Gaussians, live: LiveGrade, camera: Camera, version: object) -> Gaussians:
         """Return the scene with graded base colors of the grade's rows.
@@ -154,7 +183,8 @@ class LiveColors:
             self._table = ColorTable(drawn_colors(scene, rows, position))
             self._key = key
         before = self._table.colors
-        after = self._table.apply(live)
+        detail = self.detail(scene, live, version)
+        after = self._table.apply(live, None if detail is None else torch.from_numpy(detail))
         change = (after - before) / C0
         change[(after <= 0.0) & (before <= 0.0)] = 0.0
         sh0 = scene.sh0.clone()

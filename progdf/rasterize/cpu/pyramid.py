@@ -184,35 +184,35 @@ class Pyramid:
             other._merge(level, np.arange(1 << level), colors_only=True)
         return other
 
-    def shares_of(self, rows: Array) -> Array:
-        """Return the share of some rows in each node, then in each row of the scene, the last row first.
+    def means_of(self, values: Array) -> Array:
+        """Return the mean of a value in each node, then the value of each row, the last row first.
 
-        So a pick indexes its share: nodes count from the start, and the complements of rows from the end.
+        So a pick indexes its mean: nodes count from the start, and the complements of rows from the end.
 
         Args:
-            rows: rows of the scene. [M] int64
+            values: value of each row, such as 1 for those of a region and 0 for others. [N] float32
 
         Returns:
-            Shares of the nodes' colors, 0 to 1. [2L-1+N] float32
+            [2L-1+N] float32
         """
         count = len(self.nodes.order)
         levels = self.nodes.levels
         total = (2 << levels) - 1
-        shares = np.zeros(total + count, np.float32)
-        own = shares[::-1][:count]
-        own[rows] = 1.0
+        means = np.zeros(total + count, np.float32)
+        own = means[::-1][:count]
+        own[:] = values
         starts = np.arange(1 << levels) * count >> levels
         sizes = np.diff(starts, append=count)
         leaves = np.add.reduceat(own[self.nodes.order], starts) if count else 0.0
-        shares[total - (1 << levels) : total] = leaves / np.maximum(sizes, 1)
+        means[total - (1 << levels) : total] = leaves / np.maximum(sizes, 1)
         weights = self.nodes.means[:, WEIGHT] + np.float32(MIN_WEIGHT)
         for level in range(levels - 1, -1, -1):
             first = (1 << level) - 1
             last = 2 * first + 1
             below = slice(last, 2 * last + 1)
-            parts = (weights[below] * shares[below]).reshape(-1, 2).sum(axis=1)
-            shares[first:last] = parts / weights[below].reshape(-1, 2).sum(axis=1)
-        return shares
+            parts = (weights[below] * means[below]).reshape(-1, 2).sum(axis=1)
+            means[first:last] = parts / weights[below].reshape(-1, 2).sum(axis=1)
+        return means
 
     def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
         """Return the Gaussians to draw in place of the scene while the view changes.

@@ -28,6 +28,7 @@ PROCEDURAL = (
     "darken:0.7",
     "night",
     "grade:exposure=-0.8,temperature=0.6,contrast=0.3,saturation=0.4",
+    "grade:exposure=-0.8,clarity=0.6",
 )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from progdf.color.clarity import local_detail
 from progdf.color.grade import ColorGrade, grade_course, grade_fully, parse_grade
 from progdf.color.looks import BUILT_IN
 from progdf.field.baked import lattice_colors
@@ -23,7 +24,7 @@ from tests.helpers.ui_rig import bear
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files import user_files
 from viewer.jobs.preview_process import RegionSample
-from viewer.render import live_grade
+from viewer.render import dynamic_resolution, live_grade
 from viewer.render.dynamic_resolution import LiveScene, MovingGrade
 from viewer.render.engine import ViewEngine
 from viewer.render.live_grade import (
@@ -106,12 +107,30 @@ def test_engine_shows_the_live_grade_and_returns_to_the_scene() -> None:
     assert np.array_equal(picture(), before)
 
 
+def test_live_clarity_is_that_of_the_editor(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = with_lobes()
+    camera = to_camera(first_camera(scene), 64, 48)
+    rows = np.arange(len(scene))
+    grade = parse_grade("exposure=0.4,clarity=0.8")
+    graded = LiveColors().apply(scene, LiveGrade(rows, grade), camera, 0)
+    kept = torch.from_numpy(rows)
+    detail = local_detail(scene, kept)
+    before = drawn_colors(scene, kept, camera.position)
+    after = drawn_colors(graded, kept, camera.position)
+    expected = grade_fully(before, grade, detail)
+    assert torch.allclose(after.clamp_min(0.0), expected, atol=1e-4)
+    assert (expected - grade_fully(before, grade)).abs().max() > 0.02
+    monkeypatch.setattr(live_grade, "SIDE", 17)
+    few = ColorTable(before.clamp(0, 1)).apply(LiveGrade(rows, grade), detail)
+    assert (few - expected).abs().mean() < 0.02
+
+
 def test_shares_of_rows_in_the_pyramid_follow_the_tree() -> None:
     scene = bear().scene
     pyramid = Pyramid(activate(scene))
     total = len(pyramid.nodes.means)
     rows = np.flatnonzero(scene.means[:, 0].numpy() > 0.0)
-    shares = pyramid.shares_of(rows)
+    shares = pyramid.means_of(np.isin(np.arange(len(scene)), rows).astype(np.float32))
     assert shares.shape == (total + len(scene),)
     assert set(np.flatnonzero(shares[::-1][: len(scene)])) == set(rows), "a pick ~row indexes from the end"
     nodes = shares[:total]
@@ -119,16 +138,18 @@ def test_shares_of_rows_in_the_pyramid_follow_the_tree() -> None:
     for parent in range(total // 2):
         children = nodes[2 * parent + 1 : 2 * parent + 3]
         assert children.min() - 1e-6 <= nodes[parent] <= children.max() + 1e-6
-    everything = pyramid.shares_of(np.arange(len(scene)))
+    everything = pyramid.means_of(np.ones(len(scene), np.float32))
     assert everything == pytest.approx(1.0)
 
 
-def test_pictures_in_motion_have_the_grade_and_leave_the_scene() -> None:
+def test_pictures_in_motion_have_the_grade_and_leave_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dynamic_resolution, "MOVING_MS", (0.0, np.inf))  # the same detail in each picture
+    monkeypatch.setattr(dynamic_resolution, "FINE_MS", (0.0, np.inf))
     scene = with_lobes()
     camera = to_camera(first_camera(scene), 64, 48)
     rows = np.flatnonzero(scene.means[:, 0].numpy() > 0.0)
     live = LiveScene(scene)
-    live.begin_pyramid().result()
+    pyramid = live.begin_pyramid().result()
     before = live.drawn.colors.clone()
     plain = live.draw_fewer(lambda fewer: fewer.colors.clone(), camera, 2)
     colors = LiveColors()
@@ -137,7 +158,8 @@ def test_pictures_in_motion_have_the_grade_and_leave_the_scene() -> None:
     graded = live.draw_fewer(lambda fewer: fewer.colors.clone(), camera, 2)
     assert plain is not None
     assert graded is not None
-    share = torch.from_numpy(live._pyramid.result().shares_of(rows)[live._pyramid.result().picks])  # type: ignore[union-attr]
+    values = np.isin(np.arange(len(scene)), rows).astype(np.float32)
+    share = torch.from_numpy(pyramid.means_of(values)[pyramid.picks])
     exact = torch.lerp(plain, grade_fully(plain, GRADE), share[:, None])
     assert torch.allclose(graded, exact, atol=0.02), "as of the lattice"
     assert torch.equal(graded[share == 0.0], plain[share == 0.0])
