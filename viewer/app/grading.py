@@ -74,7 +74,9 @@ class GradePreview:
         if region == self.region_key():
             self._region = region
             self._grader.sample = sample
-            self._grader.rows = sample.rows
+            rows = self._grader.rows
+            if rows is None or not np.array_equal(rows, sample.rows):
+                self._grader.rows = sample.rows
 
     def update(self) -> None:
         """Show the grade of the form on the Gaussians of its region, and its histogram and looks."""

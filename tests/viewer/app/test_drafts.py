@@ -194,6 +194,15 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
     assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"
     with_form(window, region="all", palette=form.palette)
     assert window.main_view.work.form.palette[1][0] not in ("#000001", "#000003")
+    live = window.engine.live
+    count = requested.count("grade")
+    work = window.main_view.work
+    camera = replace(work.view.camera, azimuth=work.view.camera.azimuth + 20.0)
+    window.main_view.store.replace(replace(work, view=replace(work.view, camera=camera)))
+    for _ in range(3):
+        turn(window)
+    assert requested.count("grade") == count + 1, "the thumbnails of the looks show the new view"
+    assert window.engine.live == live, "and the grade stays"
 
 
 def test_styles_are_previewed_one_after_the_other(

@@ -134,6 +134,7 @@ class PreviewActions:
         self._painted: tuple[PreviewInputs, NDArray[np.uint8]] | None = None  # a sentence's picture
         self._sent_at = 0.0
         self._palette_of = ""  # region of the form's palette
+        self._looks_of: ViewCamera | None = None  # view of the looks' thumbnails
         self._sheet: moderngl.Texture | None = None  # thumbnails in every style
         self._sheet_of: PreviewInputs | None = None  # the painted view
         self._tiles: frozenset[int] = frozenset()  # styles painted in this view
@@ -382,7 +383,8 @@ class PreviewActions:
         if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", NO_CHANGE):
             return None
         region = self._grading.region_key()
-        if form.choice.setting == "grade" and self._palette_of != region:
+        shows_old_looks = "Looks" not in form.folded and self._looks_of != view.camera
+        if form.choice.setting == "grade" and (self._palette_of != region or shows_old_looks):
             return PreviewInputs(region, "grade", 1.0, view.camera, size, view.background)
         if form.obstacle:
             return None
@@ -488,6 +490,7 @@ class PreviewActions:
             return
         elif answer.made == "palette":
             self._palette_of = self._sent.region
+            self._looks_of = self._sent.camera
             self._grading.take(answer.sample, self._palette_of)
             work = self._store.get()
             if all(source == target for source, target in work.form.palette):
@@ -507,6 +510,8 @@ class PreviewActions:
             if self._sent.kind[1] != "grade":  # remove the preview of the previous color
                 self._store.replace(with_transient(self._store.get(), live=()))
             self._show(f"Live: {answer.note}", None, near=answer.near)
+        elif answer.pixels is not None and self._sent.kind[1] == "grade":
+            self._show("", None)  # the engine shows it
         elif answer.pixels is not None:
             kind, _, argument = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
