@@ -101,7 +101,7 @@ def run_page(name: str, folder: Path, draft: bool) -> dict[str, Path]:
                 exec(compile(block.text, f"{name}.md", "exec"), variables)
             elif block.language in ("", "bash"):
                 for line in block.text.replace("\\\n", " ").splitlines():
-                    run_line(shlex.split(line, comments=True), draft)
+                    run_line(shlex.split(line), draft)
     found = {stem: folder / f"{stem}.png" for stem in pictures(name)}
     missing = [file.name for file in found.values() if not file.exists()]
     if missing:

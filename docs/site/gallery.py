@@ -43,6 +43,20 @@ EXHIBITS = (
     _bundle("bear", "A bear in four coats"),
     _bundle("play", "A bear at play"),
     _bundle("room", "A room at dusk"),
+    Exhibit(
+        "robot",
+        "A robot in three colors",
+        (SCENES / "robot.compressed.ply", *(EDITS / f"{color}.gdf" for color in ("blue", "green", "red"))),
+        ROBOT,
+        ("--set", "blue=1", "--set", "green=0", "--set", "red=0"),
+    ),
+    Exhibit(
+        "pose",
+        "A robot that waves",
+        (SCENES / "robot.compressed.ply", EDITS / "tilt.gdf", EDITS / "wave.gdf"),
+        ROBOT,
+        ("--set", "tilt=0.6"),
+    ),
 )
 
 
