@@ -78,7 +78,7 @@ def _view_of_scene(opened: OpenStack) -> ViewState:
     if opened.session is not None:
         return opened.view
     document = opened.document
-    camera = view_camera.first_camera(document.visible_scene, up=opened.up, stored=document.stored_camera)
+    camera = view_camera.first_camera(document.framed_scene, up=opened.up, stored=document.stored_camera)
     return replace(opened.view, camera=camera)
 
 

@@ -174,7 +174,8 @@ def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.Win
     state = opened.view
     if opened.session is None:
         stored = opened.document.stored_camera
-        camera = first_camera(opened.document.scene, up=opened.up, stored=stored)
+        framed = opened.document.framed_scene if opened.document.files else opened.document.scene
+        camera = first_camera(framed, up=opened.up, stored=stored)
         state = replace(state, grid=True, camera=camera)
     return session.WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
 

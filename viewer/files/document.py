@@ -181,10 +181,17 @@ class Document:
         return replace(self, original=scenes.merge(self.files, self.states))
 
     @property
-    def visible_scene(self) -> Gaussians:
-        """Original without the rows of hidden scenes."""
-        hidden = self.hidden
-        return self.original if not bool(hidden.any()) else self.original[~hidden]
+    def framed_scene(self) -> Gaussians:
+        """Visible scenes with about equally many Gaussians each, so that a view frames all of them."""
+        visible = [state.scene for state in self.states if state.visible]
+        if not self.files or not visible:
+            return self.original
+        fewest = min(self.counts[scene] for scene in visible)
+        rows = []
+        for scene in visible:
+            own = scenes.rows_of(self.files, scene)
+            rows.append(torch.arange(own.start, own.stop, -(-self.counts[scene] // fewest)))
+        return self.original[torch.cat(rows)]
 
     @property
     def hidden(self) -> Tensor:
@@ -212,7 +219,7 @@ class Document:
     @cached_property
     def bounds(self) -> Bounds:
         """Bounds of the bulk of the visible scenes."""
-        return bounds_of(self.visible_scene)
+        return bounds_of(self.framed_scene)
 
     @cached_property
     def stored_camera(self) -> Camera | None:
@@ -223,7 +230,7 @@ class Document:
         """Compute the facts for the panel and the camera."""
         scene = self.scene
         added = [gdf.members - len(gdf.region) for gdf in (*self.edits, *self.live)]
-        shown = self.visible_scene
+        shown = self.framed_scene
         neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
             title=self.title,

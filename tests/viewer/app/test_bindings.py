@@ -56,6 +56,7 @@ INTERNAL = {
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file", "use_view", "keep_view"),
     *("carry_on", "look_behind", "refine_anyway", "fill_hole", "true_length", "keep_pull", "leave_pull"),
+    *("add_file", "show_scene", "select_scene", "move_scene", "reset_scene", "rename_scene", "remove_scene"),
     *("stop_making", "test_editor", "allow_outside", "save_look", "set_blend"),
 }
 """Actions of buttons, questions and drags that need an argument, so the command palette omits them."""

@@ -125,7 +125,9 @@ class SceneListActions:
         for index, state in enumerate(view.scenes):
             rows = scenes.rows_of(opened.files, state.scene)
             if len(region) == rows.stop - rows.start and int(region.members[0]) == rows.start:
-                self._arrange(index, replace(state, placement=state.placement.then(motion, self._origin)))
+                placement = state.placement.then(motion, self._origin)
+                self._arrange(index, replace(state, placement=placement), deselect=True)
+                self._messages.show(f"Placed {state.name}", button=("Undo", Plain("undo")))
                 return True
         return False
 
@@ -133,9 +135,11 @@ class SceneListActions:
     def _origin(self) -> Origin:
         return self._documents.get().original.origin
 
-    def _arrange(self, index: int, state: SceneState) -> None:
+    def _arrange(self, index: int, state: SceneState, deselect: bool = False) -> None:
         """Set the state of a scene; if an edit does not allow it, nothing changes."""
         view = scenes.change_state(self._store.get().view, index, state)
+        if deselect:
+            view = replace(view, selection=selection.select_none(view.selection))
         arranged = self._documents.get().arrange(view.scenes)
         self._documents.replace(arranged)
         self._store.change(view)
