@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, concatenate
@@ -156,6 +158,25 @@ def test_unlisted_scene_is_not_saved(folder: Path) -> None:
         bands = found.shN.shape[1]
         assert torch.equal(found.means, expected.means)
         assert torch.equal(found.shN, expected.shN[:, :bands])
+
+
+def test_command_places_scenes_and_finds_the_scene_of_each_edit(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = str(folder / "first.ply"), str(folder / "second.ply")
+    edits = str(folder / "hat.gdf"), str(folder / "shirt.gdf")
+    out = folder / "both.ply"
+    place = ["--place", "second=3,0,1,0,90,0,0.5"]
+    assert main(["export", first, *edits, second, *place, "-o", str(out)]) == 0
+    turned = Placement((3.0, 0.0, 1.0), (0.0, math.pi / 2, 0.0), 0.5)
+    listed = (SceneState(0, "first"), SceneState(1, "second", True, turned))
+    expected = compose(opened(folder, *listed), stack(1.0, *listed))
+    found = load_ply(out)
+    for name in ("means", "unit_quats", "log_scales", "logit_opacities", "sh0", "shN"):
+        assert torch.allclose(getattr(found, name), getattr(expected, name), atol=1e-5), name
+    for text, problem in (("other=1,2,3", "no scene of that name"), ("second=1,2", "write NAME=X,Y,Z")):
+        assert main(["export", first, second, "--place", text, "-o", str(out)]) == 2
+        assert problem in capsys.readouterr().err
 
 
 def test_equal_files_are_two_scenes(folder: Path) -> None:
