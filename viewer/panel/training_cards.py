@@ -52,20 +52,46 @@ def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
         if old_height < room:
             bar = imgui.WindowFlags_.no_scrollbar.value  # hidden while the cards grow
         imgui.begin_child("jobs", (0.0, max(min(old_height, room), 1.0)), 0, bar)
-        for job in listed:
-            with imgui_ctx.push_id(str(job.number)):
-                actions += _card(job, ui)
-            if unseen and job.number == failed:
+        slots = list[tuple[int, float]]()
+        for number, job, gap in _rows(listed, ui.job_slots):
+            top = imgui.get_cursor_pos_y()
+            if job is None:
+                imgui.dummy((1.0, gap - imgui.get_style().item_spacing.y))
+            else:
+                with imgui_ctx.push_id(str(number)):
+                    actions += _card(job, ui)
+            if unseen and number == failed:
                 imgui.set_scroll_here_y(1.0)
+            slots.append((number, imgui.get_cursor_pos_y() - top))
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
-        if imgui.is_window_hovered(imgui.HoveredFlags_.child_windows.value):
+        is_hovered = imgui.is_window_hovered(imgui.HoveredFlags_.child_windows.value)
+        if is_hovered:
             needed = max(needed, old_height)  # the other buttons stay under the pointer as a card closes
+        ui.job_slots = tuple(slots) if is_hovered else ()
         imgui.end_child()
         storage.set_float(tall, min(needed, room))
         if old_height == min(needed, room):  # the cards have their final heights
             storage.set_int(seen, failed)
     if _strip(listed, storage.get_bool(is_open), ui):
         storage.set_bool(is_open, not storage.get_bool(is_open))
+
+
+def _rows(
+    jobs: Sequence[JobCard], slots: Sequence[tuple[int, float]]
+) -> list[tuple[int, JobCard | None, float]]:
+    """Return the rows of the list: the cards, and a gap where a card has closed under the mouse.
+
+    Args:
+        jobs: jobs with a card
+        slots: number and height of the rows while the mouse is over the list, else empty
+
+    Returns:
+        Number, job (None for a gap), and height in the last frame, in window pixels.
+    """
+    known = {job.number: job for job in jobs}
+    heights = dict(slots)
+    numbers = [*heights, *(number for number in known if number not in heights)]
+    return [(number, known.get(number), heights.get(number, 0.0)) for number in numbers]
 
 
 _OPEN_SLOT = "jobs are open"

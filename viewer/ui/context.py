@@ -135,6 +135,7 @@ class UiContext:
         self.focused = ""  # part that received the keyboard last
         self.is_sliding = False  # a strength slider of the panel is dragged
         self.known_tips: dict[str, int] = {}  # tooltips shown once per session, and their last frame
+        self.job_slots: tuple[tuple[int, float], ...] = ()  # number and height of each job card
         self.fonts = load_fonts(io.fonts)
         self.fallbacks = FallbackFonts(io.fonts, self.fonts)
         self.scale = 0.0

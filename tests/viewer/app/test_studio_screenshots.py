@@ -19,11 +19,11 @@ from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.jobs.training import EditOrder
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
-from viewer.state.commands import OnItem
+from viewer.state.commands import Action, OnItem
 from viewer.state.forms import TYPED, DeliverOptions, NewEdit
 from viewer.state.transient import StartFile
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Dialog, with_transient
+from viewer.state.workspace import Dialog, JobCard, with_transient
 from viewer.ui.splash import MINIMUM_SIZE_PX
 
 Compare = Callable[[str, np.ndarray], None]
@@ -125,6 +125,28 @@ def test_screenshot_of_two_failures_with_whole_buttons(screenshot: Compare) -> N
             and hand.main_view.take_requests() == (OnItem("close_run", 2),)
         ]
         assert closes[-1] - closes[0] >= 12, "one hits it anywhere"
+
+
+def test_closed_card_leaves_a_gap_until_the_mouse_leaves(software_gpu: None) -> None:
+    film = Delivery("Film film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
+    cards = tuple(job_card(QueuedTask(number, film, "failed", error="no space")) for number in (1, 2, 3))
+
+    def closed_by(hand: Rig, jobs: tuple[JobCard, ...], y: float) -> tuple[Action, ...]:
+        hand.main_view.store.replace(replace(hand.main_view.work, jobs=jobs))
+        hand.main_view.wake()
+        hand.settle()
+        hand.click(SMALLEST[0] - 60.0, y)
+        return hand.main_view.take_requests()
+
+    with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+        found = {closed_by(hand, cards, float(y)): float(y) for y in range(342, 468, 6)}
+        first, second = (found[(OnItem("close_run", number),)] for number in (1, 2))
+        assert closed_by(hand, cards, first) == (OnItem("close_run", 1),)
+        assert closed_by(hand, cards[1:], first) == (), "the second card has not moved here"
+        assert closed_by(hand, cards[1:], second) == (OnItem("close_run", 2),)
+        hand.move(100.0, 100.0)
+        hand.settle()
+        assert hand.main_view.ui.job_slots == ()
 
 
 def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
