@@ -40,6 +40,7 @@ class Previews:
     asked = 0
 
     def __init__(self, scene: Path, _: Callable[[], None]) -> None:
+        self.scene = scene
         self.folder = scene.parent
         self._number = 0
         self._answers: list[preview_process.Preview] = []
