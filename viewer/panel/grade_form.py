@@ -32,7 +32,6 @@ from viewer.state.transient import GradeScope, LookShelf
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import (
     choice,
-    elide,
     icon_button,
     inert,
     is_double_clicked,
@@ -180,9 +179,14 @@ def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext, actions: list[Action]
                 imgui.ImTextureRef(shelf.sheet), low, high, start, end, white, 3.0 * ui.scale
             )
         else:
+            pad = 3.0 * ui.scale
             with imgui_ctx.push_font(None, SMALL_PX):
-                at = (low.x + 3.0 * ui.scale, low.y + 3.0 * ui.scale)
-                canvas.add_text(at, u32(PALETTE.dim), elide(name, wide - 6.0 * ui.scale))
+                font = imgui.get_font()
+                size = imgui.get_font_size()
+                canvas.push_clip_rect(low, high, True)
+                at = (low.x + pad, low.y + pad)
+                canvas.add_text(font, size, at, u32(PALETTE.dim), name, wide - 2.0 * pad)
+                canvas.pop_clip_rect()
         if imgui.is_item_hovered():
             form = replace(form, hovered_look=look)
             canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
