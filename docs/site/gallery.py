@@ -44,6 +44,13 @@ EXHIBITS = (
     _bundle("play", "A bear at play"),
     _bundle("room", "A room at dusk"),
     Exhibit(
+        "box",
+        "A card box with a badge",
+        (SCENES / "box.sog", EDITS / "letters.gdf", EDITS / "logo.gdf"),
+        BOX,
+        ("--set", "letters=0.7"),
+    ),
+    Exhibit(
         "robot",
         "A robot in three colors",
         (SCENES / "robot.compressed.ply", *(EDITS / f"{color}.gdf" for color in ("blue", "green", "red"))),
