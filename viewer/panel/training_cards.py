@@ -64,7 +64,8 @@ def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:
                 imgui.set_scroll_here_y(1.0)
             slots.append((number, imgui.get_cursor_pos_y() - top))
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
-        is_hovered = imgui.is_window_hovered(imgui.HoveredFlags_.child_windows.value)
+        pressed = imgui.HoveredFlags_.allow_when_blocked_by_active_item.value  # a press in a gap keeps it
+        is_hovered = imgui.is_window_hovered(imgui.HoveredFlags_.child_windows.value | pressed)
         if is_hovered:
             needed = max(needed, old_height)  # the other buttons stay under the pointer as a card closes
         ui.job_slots = tuple(slots) if is_hovered else ()
