@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from progdf.system.equality import equal_fields
+
 _MAX_LENS_RADIUS = 4.0  # largest checked ray radius, on the plane one unit before the camera (76°)
 _LENS_SAMPLES = 4096  # number of radii that are checked for folding back
 
@@ -116,6 +118,8 @@ class Camera:
         ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite, the
             viewmat is not a rotation and translation, or K has oblique axes.
     """
+
+    __eq__ = equal_fields
 
     viewmat: Tensor  # world → camera, a rotation and a translation. [4,4] float32, column vectors
     K: Tensor  # intrinsics in pixels, [[fx,0,cx],[0,fy,cy],[0,0,1]]. [3,3] float32

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.quaternions import normalize_quats
+from progdf.system.equality import equal_fields
 
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 """Attribute names in the order in which offsets are packed; see `attribute_slices`."""
@@ -35,6 +36,8 @@ class Gaussians:
     Raises:
         ValueError: a shape does not fit the others.
     """
+
+    __eq__ = equal_fields
 
     means: Tensor  # centers relative to `origin`, world units. [N,3]
     quats: Tensor  # rotations wxyz, any nonzero length. [N,4]

@@ -11,12 +11,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
+
 from .gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class Region:
     """Named set of Gaussians with a soft score."""
+
+    __eq__ = equal_fields
 
     name: str
     members: Tensor  # sorted, unique row indices into the scene. [M] int64

@@ -27,6 +27,7 @@ from progdf.quaternions import (
     turn_quats,
 )
 from progdf.sh import half_turn, rotation_change
+from progdf.system.equality import equal_fields
 
 _COLUMNS = attribute_slices(BASE_CHANNELS)
 GEOMETRY = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
@@ -43,6 +44,8 @@ part. The end of a straight rod is at √3."""
 class Motion:
     """Motion of each of P parts."""
 
+    __eq__ = equal_fields
+
     shift: Tensor  # translation of the part's center, world units. [P,3]
     log_scale: Tensor  # log of the part's scale factor. [P]
     turn: Tensor  # rotation vector, axis times angle in radians. [P,3]
@@ -51,6 +54,8 @@ class Motion:
 @dataclass(frozen=True)
 class Parts:
     """Decomposition of a region into P parts."""
+
+    __eq__ = equal_fields
 
     part: Tensor  # index of each member's part. [M] int64
     centers: Tensor  # mean of each part's centers, the pivot of rotation and scale. [P,3]
@@ -213,6 +218,8 @@ class AffineMotion:
     On the way, a part of the motion is done: the pivot moves straight, the rotation turns about one axis, and
     factors grow evenly in their logarithm. A mirror flattens the region and unfolds it on the other side.
     """
+
+    __eq__ = equal_fields
 
     shift: Tensor  # translation of the pivot, world units. [3]
     turn: Tensor  # rotation vector, axis times angle in radians, which may exceed a full turn. [3]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 
 from .oklab import (
@@ -73,6 +74,8 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
 @dataclass(frozen=True)
 class RegionColor:
     """Measured color of a region. Color edits of the region are relative to it."""
+
+    __eq__ = equal_fields
 
     color: Tensor  # typical color, sRGB 0 to 1. [3]
     shading: Shading  # lightness range of all colors of the region

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 
 from .oklab import oklab_to_srgb, srgb_to_oklab
@@ -57,6 +58,8 @@ class Shading:
 @dataclass(frozen=True)
 class Relit:
     """Lightness of new paint in the same light, and its chroma as a share of the paint's."""
+
+    __eq__ = equal_fields
 
     lightness: Tensor  # 0 to 1. [...]
     chroma: Tensor  # ≥ 0. [...]

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 
 from .oklab import srgb_to_oklab
@@ -54,6 +55,8 @@ _HALF_MAXIMUM = 0.5  # share of the lower of two peaks at which they are resolve
 @dataclass(frozen=True)
 class Surface:
     """Surface of a region, in all light."""
+
+    __eq__ = equal_fields
 
     shades: Tensor  # main colors; OKLab. [s,3]
     areas: Tensor  # visible area nearest to each, in the unit of the weights. [s]

@@ -33,6 +33,7 @@ from progdf.gdf.file import Gdf, fingerprint
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
 from progdf.region import Region
 from progdf.sh import rotation_change
+from progdf.system.equality import equal_fields
 
 from .overlap import PaintRows, tints_rim
 
@@ -57,6 +58,8 @@ class Followers:
 
     A state is one row of the scene under some of the edits. E states are composed, for F following rows.
     """
+
+    __eq__ = equal_fields
 
     rows: Rows  # rows that follow, those of each edit in a run; a pushed row comes last. [F]
     edits: Rows  # index of the edit that adds the row; -1 for a pushed row. [F]

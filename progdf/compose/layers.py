@@ -16,6 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.anchors import NOTHING
 from progdf.gdf.file import Gdf
 from progdf.gdf.texture import ColorSplit
+from progdf.system.equality import equal_fields
 
 BLENDS = ("normalized", "sum", "over", "adjust")
 """Blend rules for layers that share a Gaussian, see `progdf.compose.reference.compose_layers`."""
@@ -56,6 +57,8 @@ class Gains:
 @dataclass(frozen=True)
 class Layer:
     """One edit in the stack."""
+
+    __eq__ = equal_fields
 
     gdf: Gdf  # the edit
     strength: float = 1.0  # slider value s, 0 to 1; values above 1 extrapolate
@@ -197,6 +200,8 @@ def check_weights(layer: Layer) -> None:
 @dataclass(frozen=True)
 class Change:
     """Rows and attributes that an update changed."""
+
+    __eq__ = equal_fields
 
     rows: NDArray[np.int64]  # sorted indices of all Gaussians that may differ from before. [M]
     attributes: tuple[str, ...]  # names from `gaussians.ATTRIBUTES` that may differ in these rows

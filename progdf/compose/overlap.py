@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from progdf.gaussians import Gaussians
 from progdf.gdf.anchors import NOTHING
 from progdf.gdf.file import Gdf
+from progdf.system.equality import equal_fields
 
 from .layers import Layer
 from .paint_sheets import Overlap, added_count, find_overlap, find_sheet
@@ -70,6 +71,8 @@ class PaintRows:
 @dataclass(frozen=True)
 class PaintLayer:
     """Active layer of paint in a stack."""
+
+    __eq__ = equal_fields
 
     edit: int  # index of the edit
     strength: float  # strength times the gain of opacity, 0 to 1

@@ -22,6 +22,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.gdf.texture import ColorSplit, Split, color_split
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 
 from .added import extend
 from .follow import (
@@ -374,6 +375,8 @@ def changed_rows(
 @dataclass(frozen=True)
 class _LayerMembers:
     """Members of a layer with nonzero weight, m in number."""
+
+    __eq__ = equal_fields
 
     layer: Layer  # the layer
     members: Tensor | slice  # member indices; a slice if all members are included. [m] int64

@@ -16,6 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
 from progdf.sh import rgb_to_sh0
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 
 from .light import OUTDOORS, Daylight, develop, irradiance, view_dependent_light
@@ -92,6 +93,8 @@ BARE = GaussianLayout()
 class SurfacePaint:
     """Appearance of a surface before lighting."""
 
+    __eq__ = equal_fields
+
     color: Tensor  # sRGB, 0 to 1. [N,3]
     relief: Tensor  # offset of the normals, for lighting only. [N,3]
     velvet: float = 0.0  # brightening where the surface turns away from the eye, sRGB units
@@ -140,6 +143,8 @@ _MAX_SAMPLES_PER_GAUSSIAN = 10_000  # samples per visible Gaussian; a part that 
 @dataclass(frozen=True)
 class DemoScene:
     """Scene with labels and cameras."""
+
+    __eq__ = equal_fields
 
     gaussians: Gaussians  # the scene
     labels: Tensor  # label of each Gaussian, an index into `label_names`. [N] uint8

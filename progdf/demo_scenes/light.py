@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.color.oklab import smoothstep, srgb_from_linear
+from progdf.system.equality import equal_fields
 
 from .surface import Part
 
@@ -31,6 +32,8 @@ OUTDOORS = Daylight()
 @dataclass(frozen=True)
 class Lamp:
     """Directional light."""
+
+    __eq__ = equal_fields
 
     direction: Tensor  # unit vector towards the light. [3]
     color: Tensor  # linear RGB. [3]

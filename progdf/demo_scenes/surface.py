@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
+
 _GOLDEN = (math.sqrt(5) - 1) / 2
 _PROFILE_POINTS = 513  # points along a profile
 _ANGLE_STEPS = 64  # steps around the axis
@@ -17,6 +19,8 @@ _ANGLE_STEPS = 64  # steps around the axis
 @dataclass(frozen=True)
 class Shape:
     """Surface of revolution about the local y axis, or a flat square."""
+
+    __eq__ = equal_fields
 
     # radius and height along the profile, with the outside on the left; None is the flat square with x and z
     # from −1 to 1 that faces up. [P,2]
@@ -128,6 +132,8 @@ def panel() -> Shape:
 class Part:
     """Shape with a transform and its sampling settings."""
 
+    __eq__ = equal_fields
+
     name: str  # name of the part, which selects its paint
     label: str  # name of the label of its Gaussians
     shape: Shape  # the surface
@@ -170,6 +176,8 @@ class Part:
 @dataclass(frozen=True)
 class Samples:
     """Samples on the surface of one part."""
+
+    __eq__ = equal_fields
 
     points: Tensor  # world positions. [N,3]
     local: Tensor  # the same positions in the shape's coordinates. [N,3]

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 from progdf.io.tensors import check_ascent, check_levels, check_tensor, deflate, inflate
+from progdf.system.equality import equal_fields
 
 from .neural import NeuralField
 
@@ -87,6 +88,8 @@ def member_ranges(members: int) -> list[slice]:
 class AttributeBases:
     """Bases of one attribute with c channels, for M members."""
 
+    __eq__ = equal_fields
+
     end_offset: Tensor  # basis 0, the offset at s = 1, in stored form. [M,c] int8, int16 or float32
     residual_basis: Tensor  # bases 1..R in stored form. [R,M,c] int8, float16 or float32
     scale: Tensor  # raw-space value of one stored unit, per basis (0 first) and channel. [1+R,c] float32
@@ -131,6 +134,8 @@ class AttributeBases:
 class BakePlan:
     """Parameters of baking a field, so that every load gives the same result."""
 
+    __eq__ = equal_fields
+
     knots: Tensor  # strengths at which the field is evaluated, ascending from 0 to 1. [S] float32
     ranks: Mapping[str, int]  # bases in addition to the full offset, by attribute
     # share of the end's error to add at each knot, by attribute, 0 first, 1 last. [S] float32
@@ -172,6 +177,8 @@ class NeuralForm:
 @dataclass(frozen=True)
 class SliderRemap:
     """Piecewise linear map from strengths on an old slider to positions on a new one."""
+
+    __eq__ = equal_fields
 
     old: Tensor  # ascending from 0 to 1. [K] float64
     new: Tensor  # the same strengths on the new slider, ascending from 0 to 1. [K] float64
@@ -247,6 +254,8 @@ class GradeForm:
     Raises:
         ValueError: its parts do not fit each other.
     """
+
+    __eq__ = equal_fields
 
     degree: int  # degree of the map, 1 to 3, or `LATTICE`
     knots: Tensor  # strengths at which the map is given, ascending from 0 to 1. [S] float32
@@ -348,6 +357,8 @@ def unpack_levels(functions: Tensor, levels: Tensor, bases: int, members: int, c
 @dataclass(frozen=True)
 class BakedField:
     """Field as stored bases of M members and their coefficients over the strength."""
+
+    __eq__ = equal_fields
 
     kind: str  # "grade", "separable", "keyframes" or "neural"
     knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32

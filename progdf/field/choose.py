@@ -25,6 +25,7 @@ import torch
 from torch import Tensor
 
 from progdf.metrics.image import LEVEL, ROUNDING, decibels
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads
 
 from .baked import END_TYPES, BakedField, interpolate_at
@@ -408,6 +409,8 @@ def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
 @dataclass(frozen=True)
 class RenderedTrajectories:
     """Rendered effect of straightening each attribute."""
+
+    __eq__ = equal_fields
 
     trajectories: Mapping[str, AttributeTrajectory]  # by attribute
     gram: Tensor  # inner products of the rendered changes over pixels and channels. [A,T,A,T] float64

@@ -22,6 +22,7 @@ from torch.nn.functional import grid_sample, pad
 
 from progdf.gaussians import BASE_CHANNELS
 from progdf.sh import C0, basis
+from progdf.system.equality import equal_fields
 
 from .baked import (
     LATTICE,
@@ -384,6 +385,8 @@ def _basis_shares(course: Tensor, weights: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class ResidualBases:
     """Exact bases of a residual, made one at a time. `residual_bases` is the plain form."""
+
+    __eq__ = equal_fields
 
     course: Tensor  # residual of the lowest bands at each knot. [S,M,3b]
     mix: Tensor  # share of each knot in each basis, strongest first. [S,S] float32

@@ -24,6 +24,7 @@ from torch.nn.functional import linear, silu
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
 from progdf.io.tensors import check_tensor
+from progdf.system.equality import equal_fields
 
 Inputs = Literal["own", "position"]
 Bins = Literal["smooth", "hard"]
@@ -124,6 +125,8 @@ class NeuralField:
     Raises:
         ValueError: a tensor is absent or has the wrong shape or type.
     """
+
+    __eq__ = equal_fields
 
     shape: NeuralShape  # layout
     tensors: Mapping[str, Tensor]  # `shape.weights()` in float16 or float32, `shape.frame()` in float32

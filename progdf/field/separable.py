@@ -22,6 +22,7 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 from progdf.io.tensors import check_ascent
+from progdf.system.equality import equal_fields
 
 from .baked import AttributeBases, BakedField, member_ranges
 
@@ -32,6 +33,8 @@ _MAX_LEVELS = {torch.int8: 127, torch.int16: 32767}
 @dataclass(frozen=True)
 class AttributeTrajectory:
     """Trajectory of one attribute, split into full offset and residual."""
+
+    __eq__ = equal_fields
 
     offsets: Tensor  # recorded offsets. [T,M,c] float32
     weights: Tensor  # visibility of an error in each number, ≥ 0. [M,c] float32
@@ -351,6 +354,8 @@ def fit_course(
 @dataclass(frozen=True)
 class CourseSums:
     """Sums of an unweighted trajectory that determine its bases; `AttributeTrajectory` is the plain form."""
+
+    __eq__ = equal_fields
 
     amplitude: Tensor  # see `AttributeTrajectory`. [T] float64
     residual: Tensor  # rows of the residual as sums of the offsets' rows. [T,T] float64

@@ -19,6 +19,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_ascent, check_tensor, read_tensors, write_tensors
+from progdf.system.equality import equal_fields
 
 from .baked import MONOMIALS, find_segment, identity_map, member_ranges
 
@@ -31,6 +32,8 @@ _FORMAT = "progdf-trajectory-1"
 @dataclass(frozen=True)
 class Trajectory:
     """S recordings of the members' offsets along the slider."""
+
+    __eq__ = equal_fields
 
     s: Tensor  # slider value of each recording, ascending, first 0, last 1. [S] float32
     # raw-space offsets; row 0 is zero, the last is `end` in half precision. [S,M,C] float16

@@ -12,6 +12,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.quaternions import matrix_quats, rotation_matrices
+from progdf.system.equality import equal_fields
 from progdf.terminal import escape_text
 
 from .gltf_file import REFUSED_EXTENSIONS, GltfFile, Node, entry
@@ -24,6 +25,8 @@ SIMILARITY_TOLERANCE = 1e-4  # relative deviation of a node's three scales, and 
 @dataclass(frozen=True)
 class Placement:
     """Visible instance of a mesh."""
+
+    __eq__ = equal_fields
 
     mesh: int
     node: int | None  # None: the file has no nodes

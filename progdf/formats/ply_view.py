@@ -28,6 +28,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 from progdf.io.cameras import relative_viewmat
 from progdf.io.file_rules import unsupported_error
+from progdf.system.equality import equal_fields
 
 from .ply_file import PlyFile, read_header
 
@@ -45,6 +46,8 @@ _BRUSH = "exported from brush"
 @dataclass(frozen=True)
 class PlyView:
     """Up axis and camera that a .ply stores."""
+
+    __eq__ = equal_fields
 
     up: Tensor | None = None  # in the world, unit length. [3] float32
     up_comment: str = ""  # the comment that states the up axis

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.quaternions import normalize_quats, rotate_vectors
+from progdf.system.equality import equal_fields
 
 MAX_ANCHORS = 4
 """Largest number of anchors of a row."""
@@ -44,6 +45,8 @@ class Anchors:
         ValueError: a shape or type is wrong, an index is negative, or the weights of a row are not finite,
             are negative, or sum up to neither 1 nor 0.
     """
+
+    __eq__ = equal_fields
 
     rows: Tensor  # rows of the scene; those with weight 0 have no meaning. [B,4] int64
     weights: Tensor  # 0 to 1, sum 1 per row; all 0 if the row follows nothing, as in a copy. [B,4] float32

@@ -16,6 +16,7 @@ from torch import Tensor
 from progdf.quaternions import multiply_quats, turn_quats
 from progdf.sh import half_turn, rotation_change
 from progdf.similarity import MIN_FLATNESS, AffineMotion
+from progdf.system.equality import equal_fields
 
 _SIMILAR_TOLERANCE = 1e-9  # largest relative difference of Lᵀ L from a multiple of the identity
 
@@ -28,6 +29,8 @@ class PartMotions:
         ValueError: a member has no part.
     """
 
+    __eq__ = equal_fields
+
     parts: Tensor  # index of each member's part. [M] int64
     motions: tuple[tuple[AffineMotion, ...], ...]  # motions of each part, the first one acts first
 
@@ -39,6 +42,8 @@ class PartMotions:
 @dataclass(frozen=True)
 class LinearMap:
     """Linear map of a motion at one strength."""
+
+    __eq__ = equal_fields
 
     matrix: Tensor  # L, for differences of positions. [3,3] float64
     shape: Tensor  # G, for covariances: L with a mirror at least as thick as its flattest Gaussian. [3,3]

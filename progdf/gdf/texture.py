@@ -29,6 +29,7 @@ from progdf.field.grade import MAX_COLOR, bake_grade, map_alone, monomials
 from progdf.field.separable import quantize_bases
 from progdf.gaussians import Gaussians, pack
 from progdf.sh import C0, sh0_to_rgb
+from progdf.system.equality import equal_fields
 
 from .anchors import Anchors
 from .file import Gdf
@@ -41,6 +42,8 @@ _RANK_TOLERANCE = 1e-9  # share of the largest eigenvalue below which monomials 
 @dataclass(frozen=True)
 class DiscColors:
     """Changes that the B discs of a painted layer make to the color of the surface below them."""
+
+    __eq__ = equal_fields
 
     change: Tensor  # SH band 0 of the discs minus that of the surface. [B,3]
     color: Tensor  # the part of it that the map makes. [B,3]

@@ -25,6 +25,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import ZERO, Origin
+from progdf.system.equality import equal_fields
 
 from .atomic import read_file, write_file
 from .camera_json import (
@@ -51,6 +52,8 @@ _MODEL_FILES = ("cameras.bin", "images.bin", "cameras.txt", "images.txt")
 @dataclass(frozen=True)
 class CameraReport:
     """Notes collected while a camera file is read."""
+
+    __eq__ = equal_fields
 
     notes: tuple[str, ...]  # one line each, such as the choice among several COLMAP models
     ignored: tuple[str, ...]  # fields of the file that are not read

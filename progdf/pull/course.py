@@ -20,6 +20,7 @@ from progdf.field.baked import interpolate_at
 from progdf.gaussians import Gaussians, pack
 from progdf.quaternions import matrix_turns, rotation_matrices, turn_quats
 from progdf.region import Region, from_mask
+from progdf.system.equality import equal_fields
 
 from .cuts import NO_CUTS, Cuts
 from .follow import bind, follow, rest_frames, widen
@@ -69,6 +70,8 @@ class Handle:
 @dataclass(frozen=True)
 class PullCourse:
     """Offsets of a pulled region at several strengths."""
+
+    __eq__ = equal_fields
 
     region: Region  # the M Gaussians that move
     strengths: Tensor  # from 0 to 1. [S]

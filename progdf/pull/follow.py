@@ -24,6 +24,7 @@ from torch import Tensor
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
 from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import basis, spread_directions
+from progdf.system.equality import equal_fields
 from progdf.threads import run_chunks
 
 from .follow_kernel import MAX_STRETCH, Bands, Singles, follow_rows
@@ -46,6 +47,8 @@ _COLUMNS = attribute_slices(BASE_CHANNELS)
 @dataclass(frozen=True)
 class Binding:
     """Nodes that M Gaussians follow."""
+
+    __eq__ = equal_fields
 
     weights: csr_array  # weights of the nodes; rows sum to 1, each has an entry. [M,n] float32
     firsts: NDArray[np.int32]  # first entry of each Gaussian in the next two; small ones have none. [M+1]

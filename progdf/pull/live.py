@@ -24,6 +24,7 @@ from progdf.gaussians import Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.rasterize.cpu.compilation import compile_elsewhere, is_compiled, mark_compiled
 from progdf.region import Region, from_mask, whole_scene
+from progdf.system.equality import equal_fields
 
 from .course import Handle, make_problem
 from .cuts import NO_CUTS, Cuts
@@ -58,6 +59,8 @@ class HandlePose:
 @dataclass(frozen=True)
 class LiveStep:
     """Result of one step."""
+
+    __eq__ = equal_fields
 
     pose: HandlePose  # of the handles
     # packed offsets of the members from the scene, overwritten by the step after the next. [M,C] float32

@@ -24,6 +24,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import Gaussians
 from progdf.sh import rgb_to_sh0
+from progdf.system.equality import equal_fields
 
 DILATION = 0.3
 """Blur added to the diagonal of the 2D covariance, px² (Kerbl 2023, gsplat)."""
@@ -108,6 +109,8 @@ def activate(gaussians: Gaussians, colors: Tensor | None = None) -> ActivatedGau
 @dataclass(frozen=True)
 class RasterView:
     """Camera and the window to draw of its image; see `progdf.rasterize.render`."""
+
+    __eq__ = equal_fields
 
     viewmat: Tensor
     K: Tensor
@@ -195,6 +198,8 @@ def get_engine(name: str) -> RasterEngine:
 @dataclass(frozen=True)
 class RasterInfo:
     """Results of the projection, not differentiable."""
+
+    __eq__ = equal_fields
 
     means2d: Tensor  # centers in pixels; 0 if not finite or not beyond the near plane. [N,2]
     depths: Tensor  # camera z, world units; 0 likewise. [N] float32

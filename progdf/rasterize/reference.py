@@ -14,6 +14,7 @@ from torch import Tensor
 
 from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import shade
+from progdf.system.equality import equal_fields
 
 from .engines import (
     ALPHA_MAX,
@@ -34,6 +35,8 @@ TILE = 16
 @dataclass(frozen=True)
 class ReferenceSplats:
     """V Gaussians visible in a window, nearest first."""
+
+    __eq__ = equal_fields
 
     rows: Tensor  # indices of the Gaussians. [V] int64
     means2d: Tensor  # centers in pixels. [V,2]
@@ -76,6 +79,8 @@ def color_map(
 @dataclass(frozen=True)
 class DrawnColors:
     """Color map that draws its splats again at each call."""
+
+    __eq__ = equal_fields
 
     splats: ReferenceSplats
     rows: Tensor  # rows of the colored Gaussians, all others are black. [M] int64

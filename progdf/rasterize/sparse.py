@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
+
 
 @dataclass(frozen=True)
 class SparseWeights:
@@ -37,6 +39,8 @@ class SparseWeights:
 @dataclass(frozen=True)
 class SortedEntries:
     """Entries of a sparse matrix, sorted by row (compressed sparse rows)."""
+
+    __eq__ = equal_fields
 
     counts: Tensor  # number of entries of each row. [R] int64
     columns: Tensor  # column of each entry. [E] int32

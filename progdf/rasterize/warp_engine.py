@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from progdf.errors import ProgdfError
+from progdf.system.equality import equal_fields
 
 from .cpu.jit import find_cache_folder
 from .engines import (
@@ -291,6 +292,8 @@ def list_weights_kernel(
 @dataclass(frozen=True)
 class DeviceTileLists:
     """Splats of a window's tiles, nearest first. Tiles are aligned to the full image, in row-major order."""
+
+    __eq__ = equal_fields
 
     starts: Tensor  # first index of each tile in `members`, then their number. [T+1] int32
     members: Tensor  # rows of the splats. [I] int32

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
+from progdf.system.equality import equal_fields
 
 from .bounds import quantile
 from .point_tree import PointTree
@@ -240,6 +241,8 @@ def typical_spacing(places: Tensor) -> float:
 @dataclass(frozen=True)
 class CellGrid:
     """Cells of space in and around an object."""
+
+    __eq__ = equal_fields
 
     low: Tensor  # corner of the object. [3]
     side: float  # size of a cell

@@ -31,6 +31,7 @@ from progdf.io.picture_camera import (
     layers_in_picture,
     save_picture_camera,
 )
+from progdf.system.equality import equal_fields
 
 from .match_views import ViewMatch, match_views, matched_camera, view_thumbnail
 
@@ -43,6 +44,8 @@ MAX_SCENES = 12
 @dataclass(frozen=True)
 class TakenView:
     """Picture that was taken of a scene."""
+
+    __eq__ = equal_fields
 
     image: NDArray[np.uint8]  # thumbnail. [H,W,3]
     camera: Camera  # at the size of the taken picture

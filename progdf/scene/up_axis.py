@@ -24,6 +24,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
 from progdf.io.atomic import state_folder, write_file
 from progdf.io.json_values import decode_json
+from progdf.system.equality import equal_fields
 
 from . import Axis
 from .bounds import drop_background, front_direction, long_axes, normals_of
@@ -108,6 +109,8 @@ are bent by up to this angle."""
 @dataclass(frozen=True)
 class UpAxis:
     """Up direction of a scene and the reason for it."""
+
+    __eq__ = equal_fields
 
     direction: Tensor  # in the world, unit length. [3] float32
     reason: str  # text for the user, such as "from the cameras"
@@ -263,6 +266,8 @@ def _log_prior(direction: Tensor) -> float:
 @dataclass(frozen=True)
 class _Shape:
     """Solid bulk of a scene, relative to its middle, in units of its radius."""
+
+    __eq__ = equal_fields
 
     places: Tensor  # [Q,3]
     normals: Tensor  # shortest axes. [Q,3], unit length

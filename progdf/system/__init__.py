@@ -1,1 +1,1 @@
-"""Differences between Linux, Windows and macOS, in one place: processes, files and the desktop."""
+"""Differences between systems and Python versions: processes, files, the desktop and equality."""

@@ -20,6 +20,7 @@ from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from progdf.surface.find import OPAQUE, PaintSurface, find_surface
 from progdf.surface.footprint import depth_picture, near_surface
+from progdf.system.equality import equal_fields
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
@@ -125,6 +126,8 @@ def draw_decal(path: Path, place: DecalPlacement, camera: Camera) -> Tensor:
 @dataclass(frozen=True)
 class DecalEditor:
     """Editor that places a decal on the surface that its camera sees."""
+
+    __eq__ = equal_fields
 
     scene: Gaussians
     view: View  # the camera's view

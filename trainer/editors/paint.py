@@ -16,6 +16,7 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.surface.find import OPAQUE, PaintSurface, find_surface
+from progdf.system.equality import equal_fields
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, cover_view, project_paint
 from trainer.views.picture_cameras import picture_cameras
@@ -30,6 +31,8 @@ _MAX_PAINT_SIDE_PX = 768  # maximum longer side of the paint in a view; the view
 @dataclass(frozen=True)
 class PaintLayer:
     """Paint of one view on the surface."""
+
+    __eq__ = equal_fields
 
     view: View
     drawn: Tensor  # premultiplied colors and alpha. [H,W,4]

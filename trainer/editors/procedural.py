@@ -21,6 +21,7 @@ from progdf.color.grade import ColorGrade, grade_course, measure_grade, parse_gr
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.system.equality import equal_fields
 from trainer.options import EditKind
 from trainer.views.view import BACKGROUND, View, region_box, render_colors, render_view, seen_colors
 
@@ -69,6 +70,8 @@ class ColorEditor(ProceduralEditor):
 @dataclass(frozen=True)
 class MemberEditor(ProceduralEditor):
     """Editor that changes the Gaussians' colors and renders them, so that all views show the same change."""
+
+    __eq__ = equal_fields
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64
@@ -135,6 +138,8 @@ class StripesEditor(MemberEditor):
 @dataclass(frozen=True)
 class RemoveEditor(ProceduralEditor):
     """Editor that fades the region's opacity to 0 and reveals the content behind it. Holes are not filled."""
+
+    __eq__ = equal_fields
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64

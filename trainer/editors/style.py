@@ -25,6 +25,7 @@ from progdf.io.images import to_picture
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import guess_up
+from progdf.system.equality import equal_fields
 from trainer.options import EditKind
 from trainer.views.size import SizeLimits, choose_view_size
 from trainer.views.view import View, crop, region_box, region_rig, with_near_plane
@@ -52,6 +53,8 @@ _MIN_SIDE_PX = 32  # pixels; smallest side of the network's input
 @dataclass(frozen=True)
 class StyleEditor:
     """Editor that paints views in one style."""
+
+    __eq__ = equal_fields
 
     # Function from a picture to its painting at strength 1. [h,w,3] -> [h,w,3]
     paint: Callable[[Tensor], Tensor]

@@ -18,6 +18,7 @@ from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.metrics.slider import visible_change
 from progdf.rasterize.engines import Depth, render_depth
+from progdf.system.equality import equal_fields
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
 from trainer.report.clip import CLIP_MODEL, load_clip
@@ -38,6 +39,8 @@ _REGION_WEIGHT = 0.05  # a pixel shows the region if the members' weight is abov
 @dataclass(frozen=True)
 class WarpedPair:
     """A view warped onto a held-out one."""
+
+    __eq__ = equal_fields
 
     source: str  # name of the warped view
     target: str  # name of the held-out view

@@ -29,6 +29,7 @@ from progdf.surface.models import (
     SurfaceModel,
     fit_planes,
 )
+from progdf.system.equality import equal_fields
 from trainer.views.view import render_view
 
 REACH_PX = 4.0
@@ -53,6 +54,8 @@ _MAX_SAMPLES = 2000  # largest number of samples of the surface
 @dataclass(frozen=True)
 class Ground:
     """Texture of the ground around a hole."""
+
+    __eq__ = equal_fields
 
     rows: Gaussians  # Gaussians at or behind the surface
     surface: PaintSurface  # fitted surface in the straight camera; opaque inside the hole too

@@ -33,6 +33,7 @@ from progdf.quaternions import matrix_quats
 from progdf.rasterize.engines import render, render_depth
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads
 from trainer.paint.discs import cover_pixels
 from trainer.paint.solve import ExpectedView, solve_colors
@@ -76,6 +77,8 @@ Front = tuple[Camera, Tensor, Tensor]
 @dataclass(frozen=True)
 class Hole:
     """Hole in one view, with the surface continued from its boundary."""
+
+    __eq__ = equal_fields
 
     camera: Camera
     mask: Tensor  # [H,W] bool

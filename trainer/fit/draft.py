@@ -19,6 +19,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.region import Region
+from progdf.system.equality import equal_fields
 from trainer.editors import editor_row, make_editor
 from trainer.editors.procedural import ColorEditor, edit_course
 from trainer.optimize.color_views import MAX_ERROR_SHARE, ColorMembers, ColorView, MapFit, fit_maps
@@ -38,6 +39,8 @@ _TEST_PIXELS = 500  # sampled from the test views; a map has at most 60 values
 @dataclass(frozen=True)
 class _Pixels:
     """Sampled pixels of some views."""
+
+    __eq__ = equal_fields
 
     row: View  # the pixels as one row of a picture, for the editor
     maps: MapFit  # fits color maps to the pixels

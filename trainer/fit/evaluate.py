@@ -18,6 +18,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import decibels, edge_weights, ssim
 from progdf.metrics.slider import Pictures
 from progdf.region import Region
+from progdf.system.equality import equal_fields
 from trainer.optimize.losses import Perceptual
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, render_all
@@ -35,6 +36,8 @@ _MIN_SHARE = 1 / 64  # smallest sampled share of the squares
 @dataclass(frozen=True)
 class Evaluator:
     """Held-out views prepared for comparison."""
+
+    __eq__ = equal_fields
 
     original: Tensor  # raw member rows, packed. [M,C]
     crops: Sequence[CropScene]  # boxes of the views, with the scene around the region

@@ -34,6 +34,7 @@ from progdf.field.grade import (
 )
 from progdf.field.trajectory import Trajectory
 from progdf.metrics.image import decibels
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads, one_thread
 from trainer.options import FieldOptions
 from trainer.store.memory import release_memory
@@ -45,6 +46,8 @@ from .fit import Fitted, field_evaluator, measure_choice
 @dataclass(frozen=True)
 class GradePacking:
     """Solution of a color edit, and the grades that store it."""
+
+    __eq__ = equal_fields
 
     trajectory: Trajectory
     rows: Tensor  # raw values of the members before the edit, packed. [M,14+3K]
@@ -93,6 +96,8 @@ class GradePacking:
 @dataclass(frozen=True)
 class UnbakedGrade:
     """Offsets of a grade from its map and its residual. The viewer evaluates the form of `bake_grade`."""
+
+    __eq__ = equal_fields
 
     form: GradeForm
     mapped: Tensor  # change of the members' bands by the map at each knot. [S,M,3B]

@@ -19,6 +19,7 @@ from progdf.field import BakedField
 from progdf.field.baked import SliderRemap, identity_remap
 from progdf.field.grade import member_bands, sphere
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads
 from trainer.views.setup import TrainingSetup
 
@@ -33,6 +34,8 @@ _BLOCK = 2048  # members whose colors from all directions fit into a processor's
 @dataclass(frozen=True)
 class TwoKeyframes:
     """Two keyframes of all members, a `Field`. Values that are no colors are interpolated linearly."""
+
+    __eq__ = equal_fields
 
     start: Tensor  # packed rows of the original. [M,C]
     end: Tensor  # offsets at strength 1. [M,C]

@@ -24,6 +24,7 @@ from torch.nn.functional import avg_pool2d
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
 from progdf.quaternions import rotation_matrices, turn_quats
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 from trainer.views.crops import CropScene
 
 from .nodes import NodeMotion, NodePlacement, RegionNodes, make_nodes, map_members, settle_turns
@@ -76,6 +77,8 @@ class _Memory:
 @dataclass(frozen=True)
 class NodeSearch:
     """Search for the motion of nodes that fits the training views."""
+
+    __eq__ = equal_fields
 
     original: Tensor  # raw member rows. [M,C]
     crops: Sequence[CropScene]  # the training views

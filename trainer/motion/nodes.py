@@ -32,6 +32,7 @@ from progdf.quaternions import (
     rotation_matrices,
     turn_quats,
 )
+from progdf.system.equality import equal_fields
 
 from .warp import MemberMaps, RegionMotion, rigid_path
 
@@ -49,6 +50,8 @@ _COLUMNS = attribute_slices(BASE_CHANNELS)
 @dataclass(frozen=True)
 class RegionNodes:
     """Nodes of a region, and the members that follow them."""
+
+    __eq__ = equal_fields
 
     positions: Tensor  # [n,3]
     starts: Tensor  # start of each directed edge. [E] int64
@@ -95,6 +98,8 @@ class RegionNodes:
 @dataclass(frozen=True)
 class NodeMotion:
     """Motion of n nodes."""
+
+    __eq__ = equal_fields
 
     positions: Tensor  # moved positions. [n,3]
     turn: Tensor  # rotation vector, axis times angle in radians. [n,3]

@@ -19,6 +19,7 @@ from torch.nn.functional import avg_pool2d
 from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.scene.point_tree import PointTree
 from progdf.similarity import Motion, Parts, move_rows
+from progdf.system.equality import equal_fields
 from trainer.views.crops import CropScene
 
 _NEIGHBOR_RANK = 8  # neighbor whose distance is a Gaussian's spacing: the first neighbor can be a duplicate
@@ -115,6 +116,8 @@ def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float
 @dataclass(frozen=True)
 class GroupSearch:
     """Search for the motion of the parts that fits the training views."""
+
+    __eq__ = equal_fields
 
     original: Tensor  # raw member rows. [M,C]
     parts: Parts

@@ -41,6 +41,7 @@ from progdf.similarity import (
     offsets_to,
     split_geometry,
 )
+from progdf.system.equality import equal_fields
 from trainer.views.crops import CropScene
 
 from .parts import OnStep, descend, falling, mean_distance, view_distance
@@ -64,6 +65,8 @@ _SYMMETRIC_INDICES = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # indices of a stretch's numbe
 @dataclass(frozen=True)
 class ControlPoints:
     """Control points of a region, and the members that follow them."""
+
+    __eq__ = equal_fields
 
     rows: Tensor  # members at the control points. [P] int64
     points: Tensor  # positions. [P,3]
@@ -138,6 +141,8 @@ def farthest_points(means: Tensor, count: int) -> Tensor:
 class WarpMotion:
     """Motion of P control points."""
 
+    __eq__ = equal_fields
+
     shift: Tensor  # world units. [P,3]
     turn: Tensor  # rotation vector, axis times angle in radians. [P,3]
     stretch: Tensor  # logarithm of the stretch, applied before the turn: xx yy zz xy xz yz. [P,6]
@@ -146,6 +151,8 @@ class WarpMotion:
 @dataclass(frozen=True)
 class MemberMaps:
     """Affine map x → J x + b of each member, with its rotation and growth."""
+
+    __eq__ = equal_fields
 
     matrix: Tensor  # J. [M,3,3]
     shift: Tensor  # b. [M,3]
@@ -325,6 +332,8 @@ def _stretches(motion: WarpMotion) -> Tensor:
 @dataclass(frozen=True)
 class WarpSearch:
     """Search for the motion of control points that fits the training views."""
+
+    __eq__ = equal_fields
 
     original: Tensor  # raw member rows. [M,C]
     part: Tensor  # connected part of each member. [M] int64

@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
 from trainer.quality import BALANCED, QualityLimits
 
 # ridges to try with ties: spread the residual everywhere, some way, or to neighbors only
@@ -18,6 +19,8 @@ TIED_RIDGES = (1e-8, 1e-5, 1e-3)
 @dataclass(frozen=True)
 class Model:
     """Size of the model of a color edit, and its solution for the finished edit."""
+
+    __eq__ = equal_fields
 
     degree: int  # degree of the map; 0: no map
     hold: float  # ridge of the residual, as a share of a typical member's weight

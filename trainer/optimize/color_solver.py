@@ -35,6 +35,7 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 from trainer.options import Quality
 from trainer.quality import QUALITIES, QualityLimits
@@ -87,6 +88,8 @@ GAIN_WINDOW_STEPS = 3
 class _Candidate:
     """One candidate model with its error on held-out views or pixels."""
 
+    __eq__ = equal_fields
+
     name: str
     error: float
     solver: Solver  # solver, with the mask if any
@@ -111,6 +114,8 @@ class _Candidate:
 class _Gradient:
     """Gradient and error of the training views at one residual."""
 
+    __eq__ = equal_fields
+
     descent: Tensor  # negative gradient of half the squared error. [M,b,3]
     error: float  # squared error, including the ridge and the ties
     drawn: Tensor  # members' channels that the clamps let through, per view. [V,M,3] bool
@@ -120,6 +125,8 @@ class _Gradient:
 @dataclass(frozen=True)
 class Solver:
     """Least-squares solver over all training views of a run."""
+
+    __eq__ = equal_fields
 
     views: Sequence[ColorView]  # training views
     original: Tensor  # raw member rows, packed. [M,C]

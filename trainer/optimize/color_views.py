@@ -28,6 +28,7 @@ from progdf.rasterize.cpu.engine import Array, rasterize_listed
 from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, RasterView, color_map
 from progdf.sh import C0, basis
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 from trainer.views.crops import CropScene
 from trainer.views.view import View
@@ -67,6 +68,8 @@ _B = TypeVar("_B")
 class ColorMembers:
     """Members whose colors change, shared by all views."""
 
+    __eq__ = equal_fields
+
     means: Tensor  # centers, world units. [M,3] float32
     sh: Tensor  # original coefficients of the drawn SH functions. [M,B,3] float32
 
@@ -90,6 +93,8 @@ class ColorMembers:
 @dataclass(frozen=True)
 class ColorView:
     """Pixels of one training view's box as a function of the members' colors."""
+
+    __eq__ = equal_fields
 
     map: ColorMap  # weight of each member in each pixel
     others: Tensor  # color of everything except the members, unclamped. [P,3]
@@ -325,6 +330,8 @@ class MapFit:
 
     The picture of a map is linear in the map's coefficients.
     """
+
+    __eq__ = equal_fields
 
     design: Tensor  # weight of every monomial in each pixel. [P,20] float64
     original: Tensor  # pixels before the edit, unclamped. [P,3] float64

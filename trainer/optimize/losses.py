@@ -16,6 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips
+from progdf.system.equality import equal_fields
 from trainer.options import OptimizeOptions
 
 
@@ -137,6 +138,8 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
 @dataclass(frozen=True)
 class Moment:
     """Inputs of the loss at one optimizer step."""
+
+    __eq__ = equal_fields
 
     image: Tensor  # render, differentiable. [h,w,3]
     target: Tensor  # target picture. [h,w,3]

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from progdf.gaussians import attribute_slices
 from progdf.io.json_values import convert_json, to_json
+from progdf.system.equality import equal_fields
 from trainer.options import Kind, OptimizeOptions
 from trainer.store.state import Saved, generator
 from trainer.views.boxes import probe_views
@@ -229,6 +230,8 @@ SNAPSHOTS = 32
 class PgsSettings:
     """Settings of the members' descent."""
 
+    __eq__ = equal_fields
+
     rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
     # share of a stage's steps over which its target is blended from the last stage's
     ramp: float = RAMP_SHARE
@@ -282,6 +285,8 @@ class TargetStage:
 class ParameterSnapshot:
     """One recording: the running mean of the parameters, as offsets from the original."""
 
+    __eq__ = equal_fields
+
     step: int  # optimizer steps done, over all stages
     ends_stage: bool  # last recording of its stage
     offsets: Tensor  # raw-space offsets of the members after placement. [M,C] float32
@@ -329,6 +334,8 @@ def rated_attributes(rates: Tensor) -> list[str]:
 @dataclass(frozen=True)
 class DescentTask:
     """Inputs of a run's descent that do not depend on its method."""
+
+    __eq__ = equal_fields
 
     options: OptimizeOptions  # fully resolved, see `trainer.resolve.resolve_kind`
     setup: TrainingSetup  # scene, members and views, with the rows that the edit adds

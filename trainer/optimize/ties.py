@@ -13,6 +13,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.system.equality import equal_fields
 from progdf.terminal import format_count
 from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.reach import drop_unsupported, find_fade, surface_reach
@@ -26,6 +27,8 @@ _CG_TOLERANCE = 1e-6  # relative tolerance of the solution
 @dataclass(frozen=True)
 class Ties:
     """Ties between neighbors on one surface, whose residuals should be similar."""
+
+    __eq__ = equal_fields
 
     graph: csr_matrix  # Laplacian. [M,M]
     clear: Tensor  # members that are not almost hidden in every view (`HIDDEN`). [M] bool

@@ -28,6 +28,7 @@ from progdf.rasterize.cpu.weights import ListedWeights
 from progdf.rasterize.engines import activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
 from progdf.surface.find import MIN_COSINE, PaintSurface, light_thickness
+from progdf.system.equality import equal_fields
 
 Array = NDArray[np.float64]
 
@@ -69,6 +70,8 @@ _NEWTON_STEPS = 8  # Newton steps per pixel of the projection
 class PaintedView:
     """Painted view that surface discs have to reproduce."""
 
+    __eq__ = equal_fields
+
     camera: Camera
     picture: Tensor  # painted view over the run's background. [H,W,3] 0..1
     drawn: Tensor  # paint on the surface: premultiplied colors and alpha. [H,W,4]
@@ -83,6 +86,8 @@ class PaintedView:
 @dataclass(frozen=True)
 class Discs:
     """Surface discs to add, and the rows of the scene that are moved behind them."""
+
+    __eq__ = equal_fields
 
     added: Gaussians  # state at strength 1
     rim: Tensor  # share of each disc that lies beside the paint, 0 to 1. [B]

@@ -18,6 +18,7 @@ from progdf.gaussians import Gaussians, concatenate
 from progdf.rasterize import render
 from progdf.rasterize.engines import ColorMap, Crop, activate, color_map
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 from trainer.views.view import BACKGROUND, crop, seen_colors
 
@@ -35,6 +36,8 @@ _MIN_MARGIN_PX = 32  # pixels; minimum margin around the paint in which colors a
 @dataclass(frozen=True)
 class ExpectedView:
     """View of the paint, with its expected image and the pixels to compare."""
+
+    __eq__ = equal_fields
 
     camera: Camera
     degrees: float  # rotation from the picture's camera; 0 is the picture itself

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from progdf.system.equality import equal_fields
 from trainer.optimize.losses import Moment, Perceptual, l1
 from trainer.options import OptimizeOptions
 from trainer.views.crops import CropScene
@@ -117,6 +118,8 @@ class RenderedLoss:
     L_pred is L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s. L_render is −(∇²R)² of
     the former render.
     """
+
+    __eq__ = equal_fields
 
     crops: Sequence[CropScene]  # the training views
     rows: Tensor  # raw values of the members before the edit, packed. [M,C]

@@ -13,6 +13,7 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.rasterize.engines import bare_weight
 from progdf.region import Region
+from progdf.system.equality import equal_fields
 from trainer.options import LiftRule
 
 from .few_masks import FEW, drop_strays, find_holes
@@ -36,6 +37,8 @@ class Evidence:
 
     Here w = αT, and sums run over the pixels that it contributes to, and over views.
     """
+
+    __eq__ = equal_fields
 
     inside: Tensor  # Σ w·m, contribution inside the masks. [N]
     pixels_inside: Tensor  # Σ m. [N]

@@ -27,6 +27,7 @@ from progdf.rasterize.engines import render_depth
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads, stream_threads
 from trainer.views.view import View, render_view
 
@@ -46,6 +47,8 @@ _REACH_PX = 4.0  # a surface this far behind the region's is still at its place
 @dataclass(frozen=True)
 class Remains:
     """Remains of a removed region."""
+
+    __eq__ = equal_fields
 
     seen: Tensor  # rows of the scene, visible next to the region before the removal. [R] int64, ascending
     hidden: Tensor  # rows that only the removal makes visible. [H] int64, ascending

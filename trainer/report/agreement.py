@@ -21,6 +21,7 @@ from torch import Tensor
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
+from progdf.system.equality import equal_fields
 from trainer.editors.style import smooth
 from trainer.views.boxes import shrink_view
 from trainer.views.crops import CropScene
@@ -88,6 +89,8 @@ class Agreement:
 @dataclass(frozen=True)
 class ViewChange:
     """One view's box at a smaller size: its scene, its change, and the evaluated pixels."""
+
+    __eq__ = equal_fields
 
     scene: CropScene
     change: Tensor  # edited minus original picture, times `counts`. [h,w,3]

@@ -45,6 +45,7 @@ from progdf.io.images import read_picture
 from progdf.io.picture_camera import find_picture_camera
 from progdf.scene.bounds import scene_sphere
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.cache import PictureCache, Recipe, digest
@@ -94,6 +95,8 @@ MAX_MOVED = 0.05
 @dataclass(frozen=True)
 class Painted:
     """Result of painting a view."""
+
+    __eq__ = equal_fields
 
     picture: Tensor | None  # frame, aligned with its original; None if it cannot be used. [h,w,3]
     moved: float = 0.0  # motion against the original, see `Registration`
@@ -180,6 +183,8 @@ def beside_region(mask: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class Fit:
     """Changes of the members' colors that agree best with all views."""
+
+    __eq__ = equal_fields
 
     setup: TrainingSetup
     colors: Tensor  # change of each member's color, sRGB. [M,3]

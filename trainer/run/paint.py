@@ -26,6 +26,7 @@ from progdf.rasterize.engines import activate, color_map
 from progdf.region import Region
 from progdf.sh import C0, rgb_to_sh0
 from progdf.surface.find import find_surface, orbit
+from progdf.system.equality import equal_fields
 from progdf.terminal import group_digits
 from trainer.editors.pictures import read_edit
 from trainer.paint.discs import (
@@ -68,6 +69,8 @@ _OPACITY_CHANNEL = 10  # column of a packed row, see `attribute_slices`
 class DiscLayout:
     """Paint converted to discs."""
 
+    __eq__ = equal_fields
+
     scene: Gaussians  # the scene under the discs, at strength 1
     ended: Gaussians  # this scene with occluding Gaussians pushed behind the discs
     rows: Tensor  # indices of the Gaussians that change. [M] int64
@@ -84,6 +87,8 @@ class DiscLayout:
 @dataclass(frozen=True)
 class PaintGoal:
     """Paint on a scene, and the views that the painted scene has to match."""
+
+    __eq__ = equal_fields
 
     scene: Gaussians  # the scene under the discs
     paints: Sequence[PaintedView]  # painted views of one object
@@ -260,6 +265,8 @@ def choose_discs(goal: PaintGoal, log: RunLog | None) -> DiscLayout:
 class Recolor:
     """Paint as colors of the scene's Gaussians."""
 
+    __eq__ = equal_fields
+
     ended: Gaussians  # the scene at strength 1
     rows: Tensor  # indices of the Gaussians that change. [M] int64
 
@@ -365,6 +372,8 @@ def _scaled_recolor_offsets(recolored: Gdf, members: Tensor, end: Tensor, knots:
 @dataclass(frozen=True)
 class _DiscPath:
     """Path from the original to the discs, before its visible change is linear."""
+
+    __eq__ = equal_fields
 
     steps: Tensor  # positions on the path, ascending from 0 to 1. [S]
     rows: Tensor  # packed offsets of the changed rows. [S,M,C]

@@ -29,6 +29,7 @@ from progdf.scene.scene_cameras import (
     measure_coverage,
 )
 from progdf.scene.up_axis import find_up
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads
 from trainer.options import TrainingViewOptions
 
@@ -101,6 +102,8 @@ def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneC
 @dataclass(frozen=True)
 class Visibility:
     """Visibility of S members in V cameras."""
+
+    __eq__ = equal_fields
 
     visible: Tensor  # 0 to 1. [V,S]
     toward: Tensor  # unit vectors from the members to the cameras. [V,S,3]

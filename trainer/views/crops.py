@@ -24,6 +24,7 @@ from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.cpu.jit import kernel
 from progdf.rasterize.engines import DILATION, ColorMap, RasterView, color_map
 from progdf.sh import basis
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads, threads
 
 from .view import seen_colors
@@ -101,6 +102,8 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
 @dataclass(frozen=True)
 class CropScene:
     """Content of one view's box, prepared for rendering with other member rows."""
+
+    __eq__ = equal_fields
 
     camera: Camera  # the whole view
     box: Crop  # the pixels that are rendered

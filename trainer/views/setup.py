@@ -19,6 +19,7 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import ELEVATIONS, HALF_SPHERE
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
+from progdf.system.equality import equal_fields
 from trainer.options import COLOR_VIEWS, VIEWS, TrainingViewOptions
 
 from .choose import (
@@ -79,6 +80,8 @@ _MAX_GLANCE_GAUSSIANS = 3_000_000  # maximum number of Gaussians rendered in all
 @dataclass(frozen=True)
 class TrainingSetup:
     """Scene, region, and views of a run, with notes on them."""
+
+    __eq__ = equal_fields
 
     scene: Gaussians  # the original, or `LowerLayers.base`
     region: Region  # members that may change

@@ -22,6 +22,7 @@ from progdf.scene.bounds import is_surrounding, near_plane, quantile, scene_sphe
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
 from progdf.sh import basis, shade
+from progdf.system.equality import equal_fields
 from progdf.threads import map_threads
 
 from .inner_rig import inner_rig
@@ -42,6 +43,8 @@ _CHANGED = 0.05  # difference of a channel above which a pixel counts as changed
 @dataclass(frozen=True)
 class View:
     """Render of the original scene from one camera, with the region in it."""
+
+    __eq__ = equal_fields
 
     camera: Camera  # the whole view; its name is the file name of its pictures
     image: Tensor  # the original, 0 to 1. [H,W,3]

@@ -23,6 +23,7 @@ from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.rasterize.cpu.pyramid_fit import fit_pyramid
 from progdf.rasterize.screen import fill_screen
 from progdf.sh import C0
+from progdf.system.equality import equal_fields
 from progdf.threads import StoppedError, stopped_by, without_pool
 from viewer.camera.view_camera import Vec3
 from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
@@ -203,6 +204,8 @@ class DrawnView:
 @dataclass(frozen=True)
 class MovingGrade:
     """Grade of pictures during motion. It changes the colors of a picture's Gaussians, not the scene's."""
+
+    __eq__ = equal_fields
 
     rows: NDArray[np.int64]  # graded rows of the scene, ascending. [M]
     # returns graded colors of drawn ones [P,3], with their detail [P] if any. -> [P,3]

@@ -19,6 +19,7 @@ from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
 from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, Crop, RasterView, activate
 from progdf.scene.selection import Floats, Mask, Surface
+from progdf.system.equality import equal_fields
 from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
@@ -32,6 +33,8 @@ MIN_SHARE = 0.25  # share of a pixel's color that a layer needs to be picked
 @dataclass(frozen=True)
 class PixelGaussians:
     """Visible Gaussians at a pixel, nearest first."""
+
+    __eq__ = equal_fields
 
     rows: NDArray[np.int64]  # indices of the Gaussians. [M] int64
     # share of each in the pixel's color; with the background's share they sum to 1. [M]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from progdf.color.oklab import srgb_to_oklab
 from progdf.gaussians import Gaussians
 from progdf.sh import sh0_to_rgb
+from progdf.system.equality import equal_fields
 
 BINS = 64
 _FALLOFF = 0.001  # share of the values that are left out at each end of the axis
@@ -32,6 +33,8 @@ class Property:
 @dataclass(frozen=True)
 class Distribution:
     """Histogram of one property."""
+
+    __eq__ = equal_fields
 
     values: Values  # of every Gaussian. [N]
     low: float  # ends of the axis

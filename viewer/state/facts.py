@@ -19,6 +19,7 @@ from progdf.gdf.file import Gdf
 from progdf.gdf.texture import has_texture
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb
+from progdf.system.equality import equal_fields
 from progdf.terminal import format_count, group_digits
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, keep_camera, to_camera
 
@@ -55,6 +56,8 @@ def _no_rows(_: NDArray[np.bool_]) -> NDArray[np.int64]:
 @dataclass(frozen=True)
 class LayerRow:
     """Facts about one .gdf that the panel shows."""
+
+    __eq__ = equal_fields
 
     count: int  # Gaussians in its region
     swatch: Rgb  # their mean color at full strength, 0 to 1

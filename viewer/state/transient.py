@@ -16,6 +16,7 @@ from progdf.painting.projection import ViewSurface
 from progdf.painting.strokes import ColorStroke
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import Centers, Mask, Surface
+from progdf.system.equality import equal_fields
 from viewer.camera.decal_warp import DecalFrame, DecalMesh
 from viewer.camera.photograph import Photograph
 from viewer.camera.view_camera import Vec3, ViewCamera
@@ -70,6 +71,8 @@ Transform = Literal["move", "rotate", "scale"]
 class TypedTransform:
     """Transform that a key began. A typed number or the mouse gives its value until a click or Enter."""
 
+    __eq__ = equal_fields
+
     does: Transform
     start: NDArray[np.float64] = field(compare=False)  # matrix of the handles before it. [4,4]
     axes: str = ""  # world axes, such as "X", or "YZ" for a plane; "" for all, or for the view's axis
@@ -102,6 +105,8 @@ class GizmoPose:
 @dataclass(frozen=True)
 class Gizmo:
     """Handles around the selection being moved."""
+
+    __eq__ = equal_fields
 
     does: Literal["transform", "duplicate"]
     center: tuple[float, float, float]  # center of the selection, where the handles start

@@ -23,6 +23,7 @@ from torch import Tensor
 from progdf import __version__
 from progdf.color.edits import hex_color
 from progdf.io.images import to_picture
+from progdf.system.equality import equal_fields
 from shaders import load_source
 
 MODULES = (
@@ -67,6 +68,8 @@ def build_widget() -> str:
 @dataclass(frozen=True)
 class PageTexts:
     """Texts and colors of a page besides its scene."""
+
+    __eq__ = equal_fields
 
     title: str  # above the sliders, and in the browser's tab
     credit: str  # below the sliders, with addresses as links

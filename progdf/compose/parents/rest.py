@@ -18,6 +18,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, pack
 from progdf.gdf.motions import LinearMap
 from progdf.quaternions import multiply_quats
 from progdf.similarity import stretch_axes
+from progdf.system.equality import equal_fields
 
 from .rows import is_move, part_maps, still
 
@@ -33,6 +34,8 @@ _BANDS = slice(BASE_CHANNELS, None)
 @dataclass(frozen=True)
 class RestFrame:
     """Inverse motions of M members, for G groups of members that the moves treat alike."""
+
+    __eq__ = equal_fields
 
     group: Tensor  # group of each member. [M] int64
     matrices: Tensor  # inverse maps of differences of positions. [G,3,3] float64
@@ -103,6 +106,8 @@ def rest_frame(scene: Gaussians, layers: Sequence[Layer], blend: str, members: T
 @dataclass(frozen=True)
 class _Inverse:
     """Inverse of the moves of one group."""
+
+    __eq__ = equal_fields
 
     matrix: Tensor
     shape: Tensor

@@ -38,6 +38,7 @@ from progdf.gdf.file import Gdf
 from progdf.gdf.motions import LinearMap, linear_map
 from progdf.quaternions import multiply_quats
 from progdf.similarity import stretch_axes
+from progdf.system.equality import equal_fields
 
 MOVED = ("means", "log_scales", "quats", "shN")
 """Attributes that a move changes and carries."""
@@ -71,6 +72,8 @@ def leaves_rows(gdf: Gdf) -> bool:
 @dataclass(frozen=True)
 class Anchored:
     """Rows that an edit adds, and the anchors of each among the members of a move."""
+
+    __eq__ = equal_fields
 
     rows: Tensor  # rows of the scene. [R]
     members: Tensor  # index of the member that each anchor is; those with weight 0 have no meaning. [R,4]
@@ -191,6 +194,8 @@ def carry_members(
 @dataclass(frozen=True)
 class _Displaced:
     """Members of one part of a move that other layers have changed."""
+
+    __eq__ = equal_fields
 
     rows: Tensor  # rows of the chosen members. [m]
     changed: Mapping[str, Tensor]  # those of them that are in the part and have changed, by attribute. [m]

@@ -10,6 +10,7 @@ import numpy as np
 from imgui_bundle import imgui, imgui_ctx
 from numpy.typing import NDArray
 
+from progdf.system.equality import equal_fields
 from progdf.system.processes import resident_bytes
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, PixelGaussians, outlines, seen_at
 from viewer.render.properties import Distribution, distribution
@@ -29,6 +30,8 @@ _RATE_FRAMES = 20  # frames averaged for the rate
 @dataclass(frozen=True)
 class _Probe:
     """Gaussians of one pixel, with the text and the outlines to draw."""
+
+    __eq__ = equal_fields
 
     key: object  # picture and pixel
     lines: tuple[str, ...] = ()

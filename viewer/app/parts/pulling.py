@@ -42,6 +42,7 @@ from progdf.pull.live import (
 )
 from progdf.region import Region, from_mask
 from progdf.scene.point_tree import PointTree
+from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
 from progdf.tidy import Step, tidy
 from viewer.app.messages import Requests, error_line
@@ -87,6 +88,8 @@ class _Problem:
 @dataclass(frozen=True)
 class _Prepared:
     """Live pull with its edit in progress, and a composer that includes it."""
+
+    __eq__ = equal_fields
 
     problem: _Problem
     owners: NDArray[np.int64]  # index of the tool's handle that each point of the pull moves with. [K]

@@ -22,6 +22,7 @@ from progdf.pull.live import edit_in_progress, write_offsets
 from progdf.region import Region, from_mask
 from progdf.scene.subject import ground_height
 from progdf.similarity import AffineMotion, affine_motion
+from progdf.system.equality import equal_fields
 from progdf.tidy import Step, tidy
 from viewer.app.messages import Requests
 from viewer.app.parts.making import LayerMaker, Progress
@@ -42,6 +43,8 @@ _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
 @dataclass(frozen=True)
 class _Selected:
     """Selected Gaussians of the scene, and selected paint."""
+
+    __eq__ = equal_fields
 
     region: Region  # Gaussians of the original
     leaves_paint: bool  # paint lies on them, and none of it is selected
