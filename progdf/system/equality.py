@@ -14,11 +14,12 @@ def equal_fields(first: Any, second: object) -> bool:
     3.12 Python does this by itself, because it compares tuples of the fields. From 3.13 on it compares field
     by field, which raises for the same array, too.
     """
+    kind: Any = type(first)
     if first is second:
         return True
-    if second.__class__ is not first.__class__:
-        return NotImplemented
-    names = _compared_names(first.__class__)
+    if type(second) is not kind:
+        return NotImplemented  # type: ignore[no-any-return]  # an operator's answer, which Python replaces
+    names = _compared_names(kind)
     return tuple(getattr(first, name) for name in names) == tuple(getattr(second, name) for name in names)
 
 
