@@ -27,6 +27,7 @@ from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
+from progdf.system.equality import equal_fields
 from progdf.terminal import print_line
 
 from .options import parse_options
@@ -58,6 +59,8 @@ class RebindOptions:
 @dataclass(frozen=True)
 class Match:
     """Assignment of A's Gaussians to those of B, with its quality."""
+
+    __eq__ = equal_fields
 
     rows: Rows  # row of A for each row of B. [N] int64
     matched: float  # share of B's rows that match in position and color, 0 to 1

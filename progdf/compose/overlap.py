@@ -45,6 +45,8 @@ Rows = NDArray[np.int64]
 class PaintRows:
     """Rows of painted layers of an extended scene that depend on other layers."""
 
+    __eq__ = equal_fields
+
     rows: Rows  # rows of the scene, ascending. [A]
     edits: Rows  # index of the edit that adds each row. [A]
     members: Rows  # its position among the members of this edit. [A]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.system.equality import equal_fields
 
 from .follow import COLORS, changes_shape, find_rims
 from .layers import Layer
@@ -40,6 +41,8 @@ Rows = NDArray[np.int64]
 @dataclass(frozen=True)
 class _RimOverlap:
     """Part of an `Overlap` whose upper rows are rims; the fields are as there."""
+
+    __eq__ = equal_fields
 
     over: Rows  # [R]
     under: Rows  # [R]

@@ -20,6 +20,7 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.quaternions import normalize_quats, rotation_matrices
+from progdf.system.equality import equal_fields
 from progdf.threads import run_chunks, threads
 
 from .overlap_kernel import MIN_WEIGHT, cover_points
@@ -49,6 +50,8 @@ class Overlap:
     Rows are indices into `PaintRows.rows`.
     """
 
+    __eq__ = equal_fields
+
     over: Rows  # rows of the upper layer on the lower one. [P]
     under: Rows  # row of the lower layer that is most visible there. [P]
     cover: Floats  # opacity of the lower layer there at strength 1. [P]
@@ -62,6 +65,8 @@ class Overlap:
 class Sheet:
     """Discs of a painted layer at strength 1."""
 
+    __eq__ = equal_fields
+
     points: Floats  # centers. [B,3]
     axes: Floats  # columns are the axes. [B,3,3]
     scales: Floats  # standard deviations along the axes. [B,3]
@@ -74,6 +79,8 @@ class Sheet:
 @dataclass(frozen=True)
 class Grid:
     """Discs of similar size of a sheet, sorted into cells of a grid."""
+
+    __eq__ = equal_fields
 
     discs: Floats  # see `cover_points`. [b,16]
     ids: Rows  # their indices in the sheet. [b]

@@ -99,6 +99,8 @@ class PullCourse:
 class Problem:
     """Graph and solver of a pull."""
 
+    __eq__ = equal_fields
+
     members: Rows  # rows of the scene that the graph covers. [M]
     graph: NodeGraph
     held: Mask  # nodes that stay in place. [n]

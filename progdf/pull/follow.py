@@ -62,6 +62,8 @@ class Binding:
 class Frames:
     """Principal axes of M Gaussians at one strength, the start for the next."""
 
+    __eq__ = equal_fields
+
     # axes times scales at rest relative to the largest, least squared scale, log of the largest, the largest.
     # [M,12]
     halves: Singles

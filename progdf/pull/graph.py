@@ -25,6 +25,7 @@ from progdf.gaussians import Gaussians
 from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
+from progdf.system.equality import equal_fields
 from progdf.threads import run_chunks
 
 from . import graph_kernel
@@ -54,6 +55,8 @@ _PAIR_CHUNK = 1 << 14  # Gaussians whose pairs a thread measures at once
 @dataclass(frozen=True)
 class NodeGraph:
     """Deformation graph with n nodes and E directed edges, both directions of each."""
+
+    __eq__ = equal_fields
 
     positions: Floats  # means of the nodes' Gaussians, weighted by opacity. [n,3]
     node_of: Rows  # node of each Gaussian. [M]

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
+from progdf.system.equality import equal_fields
+
 from . import solve_kernel
 from .graph import Floats, Mask, NodeGraph, Rows
 
@@ -33,6 +35,8 @@ _GRADIENT_PRIOR = 0.05  # weight of the rotation in a node's gradient, as a shar
 @dataclass(frozen=True)
 class Pose:
     """Deformed state of the n nodes."""
+
+    __eq__ = equal_fields
 
     positions: Floats  # [n,3]
     rotations: Floats  # [n,3,3]

@@ -24,6 +24,7 @@ from progdf.metrics.image import decibels
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize.engines import render
 from progdf.region import Region, from_mask
+from progdf.system.equality import equal_fields
 from progdf.terminal import format_count, group_digits
 from progdf.threads import map_threads
 
@@ -57,6 +58,8 @@ _BACKGROUND = (0.5, 0.5, 0.5)  # background that shows both black and white fog
 @dataclass(frozen=True)
 class Strays:
     """Rows of the strays of a scene by kind, disjoint. [M] int64 each, ascending"""
+
+    __eq__ = equal_fields
 
     faint: Rows  # too transparent to be drawn, see `INVISIBLE`
     giants: Rows  # unusually long, with ends in empty space

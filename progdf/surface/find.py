@@ -20,6 +20,7 @@ from progdf.gaussians import Gaussians
 from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.rasterize.engines import Crop, Depth, render_depth
+from progdf.system.equality import equal_fields
 
 from .models import (
     MIN_SAMPLES,
@@ -74,6 +75,8 @@ class SurfaceFit:
 @dataclass(frozen=True)
 class PaintSurface:
     """Surface that a camera sees under its paint."""
+
+    __eq__ = equal_fields
 
     camera: Camera
     depth: Array  # camera z, world units. [H,W]
@@ -234,6 +237,8 @@ def light_moments(scene: Gaussians, camera: Camera, window: Crop | None = None) 
 @dataclass(frozen=True)
 class LocalSurface:
     """Depths for paint, and their continuous pieces."""
+
+    __eq__ = equal_fields
 
     depth: Array  # camera z, world units. [H,W]
     slopes: Array  # derivatives of the depth by column and by row, world units per pixel. [2,H,W]

@@ -106,6 +106,8 @@ class MemberEditor(ProceduralEditor):
 class ClarityEditor(MemberEditor):
     """Editor of a grade with clarity, which depends on the surroundings of each Gaussian."""
 
+    __eq__ = equal_fields
+
     grade: ColorGrade
     detail: Tensor  # see `local_detail`. [M]
 
@@ -117,6 +119,8 @@ class ClarityEditor(MemberEditor):
 @dataclass(frozen=True)
 class StripesEditor(MemberEditor):
     """Editor that paints a pattern on the Gaussians: the same stripes in every view."""
+
+    __eq__ = equal_fields
 
     pattern: Tensor  # stripe coverage of each member, 0..1. [M]
     target: Tensor  # stripe color, sRGB 0..1. [3]

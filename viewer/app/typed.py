@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from progdf.camera import Camera
 from progdf.similarity import MIN_STRETCH, affine_motion
 from progdf.surface.footprint import fit_footprint
+from progdf.system.equality import equal_fields
 from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.render.picking import surface_point
 from viewer.state.transient import Gizmo, Pivot, PlacedPart, Transform, TypedTransform
@@ -308,6 +309,8 @@ def on_surface(
 @dataclass(frozen=True)
 class Fields:
     """Values of the fields: the pivot's position, rotation about X, then Y, then Z, and factors."""
+
+    __eq__ = equal_fields
 
     position: Floats  # from the center of the selection before the motion, world units. [3]
     angles: Floats  # degrees. [3]

@@ -150,6 +150,8 @@ DecalGrip = Literal["", "move", "scale", "rotate"]
 class Decal:
     """Picture with transparency and its placement in the window."""
 
+    __eq__ = equal_fields
+
     path: Path
     texture: int  # GL name
     texture_size: tuple[int, int]  # pixels

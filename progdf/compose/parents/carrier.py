@@ -22,6 +22,7 @@ from progdf.field.stored_bases import StoredBases
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.gdf.motions import LinearMap
+from progdf.system.equality import equal_fields
 
 from .rows import MOVED, Anchored, anchored_rows, carry_added, carry_members, is_move, part_maps
 
@@ -34,6 +35,8 @@ _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and f
 @dataclass(frozen=True)
 class _Move:
     """Edit that carries others."""
+
+    __eq__ = equal_fields
 
     gdf: Gdf
     bases: Mapping[str, StoredBases]  # offsets of the moved attributes

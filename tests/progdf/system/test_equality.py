@@ -14,7 +14,7 @@ from progdf.system.equality import equal_fields
 from tests.helpers.paths import ROOT
 from tests.test_structure import parse, source_files
 
-ARRAYS = {"Tensor", "NDArray", "ndarray"}
+ARRAYS = {"Tensor", "NDArray", "ndarray", "Floats", "Rows", "Singles", "Mask", "Pixels"}
 CONTAINERS = {"Callable", "tuple", "list", "dict", "Mapping", "Sequence"}
 """Types that compare the same array as equal to itself."""
 
@@ -43,14 +43,17 @@ def test_pictures_with_the_same_array_are_equal_and_one_key() -> None:
 
 
 def unsafe_classes(source: str) -> Iterator[str]:
-    """Yield the dataclasses with an array as a field whose equality is Python's own."""
+    """Yield the dataclasses with arrays, also those of a base in the file, whose equality is Python's own."""
+    holders: set[str] = set()
     for node in ast.walk(parse(source)):
         if not isinstance(node, ast.ClassDef):
             continue
+        if any(map(holds_array, node.body)) or holders & {ast.unparse(base) for base in node.bases}:
+            holders.add(node.name)
         decorators = [ast.unparse(decorator) for decorator in node.decorator_list]
         generated = any(text.startswith("dataclass") and "eq=False" not in text for text in decorators)
         own = any("__eq__" in (getattr(line, "name", ""), ast.unparse(line)[:6]) for line in node.body)
-        if generated and not own and any(map(holds_array, node.body)):
+        if generated and not own and node.name in holders:
             yield node.name
 
 
