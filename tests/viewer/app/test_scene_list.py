@@ -20,6 +20,7 @@ from viewer.app.app import App
 from viewer.files import session
 from viewer.state import selection
 from viewer.state.commands import OnItem, Plain, WithText
+from viewer.state.transient import Gizmo
 from viewer.state.view_state import SceneState
 from viewer.state.workspace import with_transient
 
@@ -81,7 +82,7 @@ def test_moved_scene_is_placed_without_a_layer(app: App) -> None:
     app.handle(OnItem("move_scene", 1))
     app.draw()
     gizmo = app.store.get().transient.gizmo
-    assert gizmo is not None
+    assert isinstance(gizmo, Gizmo)
     matrix = np.eye(4)
     matrix[:3, 3] = 0.5, 0.25, -0.125
     app.store.replace(with_transient(app.store.get(), gizmo=replace(gizmo, matrix=matrix)))

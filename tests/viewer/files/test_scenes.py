@@ -19,8 +19,9 @@ from progdf.io.bundle import unpack_bundle
 from tests.helpers.edits import curved_field, edit_of, growing, some_rows
 from tests.helpers.scenes import random_gaussians
 from viewer.files import document, session
-from viewer.files.document import Document, SceneFile
+from viewer.files.document import Document
 from viewer.files.edited_scene import compose, save_bundle
+from viewer.files.scenes import SceneFile
 from viewer.files.session import WindowSession
 from viewer.state.selection import NamedRegion, pack, unpack
 from viewer.state.view_state import LayerState, SceneState, ViewState
