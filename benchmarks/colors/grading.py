@@ -152,7 +152,7 @@ def measure(
         main_view.store.replace(replace(main_view.work, form=form, form_open=True))
         for _ in range(3):
             mouse.frame()
-        preview.take(_sample(scene), preview.region_key())
+        preview.take(_sample(scene), (), preview.region_key())
         mouse.wait_pyramid()
         mouse.move(*_slider_at(size, EXPOSURE[0]))
         mouse.press()

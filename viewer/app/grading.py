@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import moderngl
@@ -53,6 +53,7 @@ class GradePreview:
         self._engine = engine
         self._grader = FormGrader()
         self._region = ""  # region of the grader's rows, see `region_key`
+        self._palette: tuple[str, ...] = ()  # main colors of this region, #rrggbb
         self._sheet: moderngl.Texture | None = None
         self._looks: tuple[tuple[str, str], ...] | None = None  # None: to be read again
         self._drawn: tuple[RegionSample, tuple[tuple[str, str], ...]] | None = None  # inputs of the sheet
@@ -69,14 +70,18 @@ class GradePreview:
         form = work.form
         return f"{form.region}|{form.typed_region}|{hash(work.view.selection.members)}"
 
-    def take(self, sample: RegionSample, region: str) -> None:
-        """Take over the sample of a region; it is dropped if the form has another region by now."""
+    def take(self, sample: RegionSample, palette: Sequence[str], region: str) -> None:
+        """Take over the sample and the main colors of a region, unless the form has another one by now."""
         if region == self.region_key():
             self._region = region
             self._grader.sample = sample
             rows = self._grader.rows
             if rows is None or not np.array_equal(rows, sample.rows):
                 self._grader.rows = sample.rows
+            self._palette = tuple(palette)
+            if all(source == target for source, target in self._store.get().form.palette):
+                self._set_palette()
+            self._store.wake()
 
     def update(self) -> None:
         """Show the grade of the form on the Gaussians of its region, and its histogram and looks."""
@@ -86,6 +91,8 @@ class GradePreview:
         live = None
         if is_open:
             self._find_rows()
+            if not form.palette and self._palette:  # the form was opened again
+                self._set_palette()
             live = self._grader.live(form)
             self._update_scope(live)
             self._update_shelf()
@@ -98,6 +105,7 @@ class GradePreview:
     def leave_scene(self) -> None:
         """Forget the region of the closed scene."""
         self._region = ""
+        self._palette = ()
         self._grader = FormGrader()
 
     def close(self) -> None:
@@ -106,12 +114,20 @@ class GradePreview:
             self._sheet.release()
             self._sheet = None
 
+    def _set_palette(self) -> None:
+        """Put the region's main colors into the form, unchanged."""
+        work = self._store.get()
+        form = replace(work.form, palette=tuple((color, color) for color in self._palette))
+        self._store.replace(replace(work, form=form))
+        self._store.wake()
+
     def _find_rows(self) -> None:
         """Find the rows of a new region, so that it is graded before the preview process has answered."""
         key = self.region_key()
         if key == self._region:
             return
         self._region = key
+        self._palette = ()
         self._grader.sample = None
         work = self._store.get()
         count = len(self._documents.get().original)

@@ -141,6 +141,11 @@ def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
             if value > 0.0:
                 top = y + tall - value * (tall - 3.0 * ui.scale)
                 canvas.add_rect_filled((x + i * step, top), (x + (i + 1) * step, end[1]), u32(color))
+    if not scope.bins:
+        with imgui_ctx.push_font(None, SMALL_PX):
+            words = "Measuring the colors …"
+            at = x + (wide - imgui.calc_text_size(words).x) / 2, y + (tall - imgui.get_font_size()) / 2
+            canvas.add_text(at, u32(PALETTE.dim), words)
     side = 8.0 * ui.scale
     for share, corner, sign, mark in (
         (scope.black, x + 4.0 * ui.scale, 1.0, BLACK_MARK),

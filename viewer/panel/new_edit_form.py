@@ -108,6 +108,10 @@ def _content(work: Workspace, count: int, ui: UiContext, actions: list[Action]) 
         action = "new_edit"
     tip(f"Close ({shortcut('new_edit')}). Training continues")
     column = COLUMN_PX * ui.scale
+    # the name is below the window's edge here, and scrolling to it would hide histogram and looks
+    focuses_name = form.choice.setting != "grade"
+    if work.form_opening and not focuses_name:
+        imgui.set_keyboard_focus_here()
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
     if form.choice.setting == "grade":
@@ -119,7 +123,7 @@ def _content(work: Workspace, count: int, ui: UiContext, actions: list[Action]) 
             form = replace(form, asks=0, anchor="")  # the picture belonged to other settings
         form, requested = _anchor(form, preview, column)
         action = action or requested
-    if work.form_opening:
+    if work.form_opening and focuses_name:
         imgui.set_keyboard_focus_here()
     form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
     tip("Name of the layer and of its file")

@@ -204,6 +204,9 @@ def test_manual_grade_gets_the_main_colors_of_its_region(
         turn(window)
     assert requested.count("grade") == count + 1, "the thumbnails of the looks show the new view"
     assert window.engine.live == live, "and the grade stays"
+    colors = window.main_view.work.form.palette
+    with_form(window, palette=())
+    assert [source for source, _ in window.main_view.work.form.palette] == [source for source, _ in colors]
 
 
 def test_styles_are_previewed_one_after_the_other(

@@ -491,12 +491,7 @@ class PreviewActions:
         elif answer.made == "palette":
             self._palette_of = self._sent.region
             self._looks_of = self._sent.camera
-            self._grading.take(answer.sample, self._palette_of)
-            work = self._store.get()
-            if all(source == target for source, target in work.form.palette):
-                form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
-                self._store.replace(replace(work, form=form))
-            self._store.wake()
+            self._grading.take(answer.sample, answer.palette, self._palette_of)
         elif answer.made == "near":
             if answer.number == self._view_number:
                 self._show(answer.note.capitalize(), self._store.get().transient.cover, near=answer.near)
