@@ -78,7 +78,7 @@ class Preview:
     models: tuple[str, ...] = ()  # models on this machine
     follows: bool = False  # the edit of a sentence can follow this picture
     palette: tuple[str, ...] = ()  # main colors of the region, #rrggbb
-    sample: Any = None  # `RegionSample` beside a palette
+    sample: RegionSample | None = None  # beside a palette
 
 
 def _read_sample(path: Path) -> RegionSample:
