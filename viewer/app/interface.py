@@ -235,7 +235,8 @@ def draw_pill(
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
-    work, requested = tools.draw_comparison(work, words, original, place, pointer.ui)
+    room = 2.0 * min(middle - tools.LEFT_PX * scale, free - middle)
+    work, requested = tools.draw_comparison(work, words, original, place, room, pointer.ui)
     return work, [requested] if requested is not None else []
 
 

@@ -472,7 +472,7 @@ _MISSING_SIDES = {
 
 
 def draw_comparison(
-    work: Workspace, words: Labels, original: bool, place: imgui.ImVec2Like, ui: UiContext
+    work: Workspace, words: Labels, original: bool, place: imgui.ImVec2Like, room: float, ui: UiContext
 ) -> tuple[Workspace, Action | None]:
     """Draw the pill at the top of the picture that chooses the two sides and the kind of comparison.
 
@@ -480,6 +480,7 @@ def draw_comparison(
         words: labels of the comparison on screen
         original: the original is shown
         place: the middle of its upper edge, window pixels
+        room: largest width of the note below it, window pixels
 
     Returns:
         The changed workspace, and the requested action, None for none.
@@ -515,16 +516,25 @@ def draw_comparison(
             compare = _choose_comparison(compare, _sides(work), ui) if is_open else compare
         (left, top), size = imgui.get_window_pos(), imgui.get_window_size()
     if words.note:
-        _draw_note(words.note, (left + 0.5 * size.x, top + size.y), ui)
+        _draw_note(words.note, (left + 0.5 * size.x, top + size.y), room, ui)
     work = replace(work, view=replace(work.view, compare=compare))
     return work, Plain(requested) if requested else None
 
 
-def _draw_note(text: str, at: tuple[float, float], ui: UiContext) -> None:
-    """Draw a small line centered below the pill. `at`: middle of the pill's lower edge, window pixels"""
+def _draw_note(text: str, at: tuple[float, float], room: float, ui: UiContext) -> None:
+    """Draw a small text centered below the pill, on as many lines as it needs.
+
+    Args:
+        text: the text
+        at: middle of the pill's lower edge, window pixels
+        room: largest width, window pixels
+        ui: fonts and scale
+    """
     place = (at[0], at[1] + PAD_PX * ui.scale)
     with plate("comparison note", place, ui, (0.5, 0.0), PAD_PX), imgui_ctx.push_font(None, SMALL_PX):
-        imgui.text(elide(text, 2.0 * (at[0] - LEFT_PX * ui.scale)))
+        wrap = room if imgui.calc_text_size(text).x > room else -1.0
+        with imgui_ctx.push_text_wrap_pos(wrap):
+            imgui.text(text)
 
 
 def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
