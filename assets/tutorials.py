@@ -93,9 +93,9 @@ def run_page(name: str, folder: Path, draft: bool) -> dict[str, Path]:
         for block in blocks(name):
             if block.title:
                 text = block.text
-                if draft and block.language == "toml":
+                if draft and block.language == "toml":  # a catalogue
                     options = "".join(f"{key[2:]} = {_toml(value)}\n" for key, value in DRAFT.items())
-                    text = text.replace("[defaults]\n", f"[defaults]\n{options}")
+                    text = f"[defaults]\n{options}\n{text}"
                 Path(block.title).write_text(text, encoding="utf-8")
             elif block.language == "python":
                 exec(compile(block.text, f"{name}.md", "exec"), variables)
