@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for python in options.python:
             for installer in options.installer:
                 print(attempt(wheel, python, installer).row(), flush=True)
-    except (subprocess.CalledProcessError, ValueError) as error:
+    except (subprocess.CalledProcessError, ValueError, OSError) as error:
         print(f"failed: {error}\n{getattr(error, 'stdout', '') or ''}", file=sys.stderr)
         return 1
     return 0
