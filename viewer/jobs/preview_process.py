@@ -100,7 +100,6 @@ class PreviewChild:
     """
 
     def __init__(self, scene: Path, on_answer: Callable[[], None]) -> None:
-        self.scene = scene
         self._folder = tempfile.TemporaryDirectory(prefix="progdf-preview-")
         self._numbers = itertools.count(1)
         self._answers: deque[str] = deque()

@@ -132,6 +132,7 @@ class PreviewActions:
         self._grade: tuple[PreviewInputs, Gdf, Path] | None = None  # live grade: request, edit, file
         self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # `asks`, camera, size
         self._painted: tuple[PreviewInputs, NDArray[np.uint8]] | None = None  # a sentence's picture
+        self._child_scene = Path()  # scene of the process
         self._sent_at = 0.0
         self._palette_of = ""  # region of the form's palette
         self._looks_of: ViewCamera | None = None  # view of the looks' thumbnails
@@ -173,6 +174,7 @@ class PreviewActions:
         if self._child is None and not self._broken:
             try:
                 self._child = PreviewChild(scene, wake_window)
+                self._child_scene = scene
             except OSError as error:
                 self._broken = True
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
@@ -362,7 +364,7 @@ class PreviewActions:
             scene = self._own().path
         except ProgdfError:  # the region spans several scenes, which the form reports when it trains
             return None
-        if self._child is not None and self._child.scene != scene:
+        if self._child is not None and self._child_scene != scene:
             self._end()
         return scene
 
@@ -499,7 +501,7 @@ class PreviewActions:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None:
             opened = self._documents.get()
-            scene = 0 if self._child is None else opened.scene_at(self._child.scene)
+            scene = opened.scene_at(self._child_scene)
             gdf = opened.place(load_gdf(answer.grade, opened.scene_files[scene].gaussians), scene)
             self._grade = self._sent, gdf, answer.grade
             if self._sent.kind[1] != "grade":  # remove the preview of the previous color
