@@ -69,6 +69,7 @@ CLOSE_DB = 28.0
 ROUGH_DB = 22.0
 """Smallest PSNR of a draft at which the trained edit resembles its preview."""
 
+_VISIBLE_CHANGE = 0.05  # difference of a channel above which a pixel counts as changed
 _ESTIMATE_VIEWS = 8  # edited views of an estimate
 _ESTIMATE_SIDE_PX = 112  # their longer side, pixels
 
@@ -192,6 +193,8 @@ class Previewer:
     def picture(self, request: PreviewRequest) -> Tensor:
         """Return the view as edited. [H,W,3], 0 to 1
 
+        A picture with other surroundings is confined to the region, as training confines it.
+
         Raises:
             ProgdfError: invalid region or editor.
         """
@@ -200,7 +203,12 @@ class Previewer:
         if not bool((view.mask > 0.0).any()):
             return view.image
         options = replace(_options(request), seed=max(0, request.seed), cache=self._cache)
-        return self._editor(options, seen).edit(view, request.strength)
+        editor = self._editor(options, seen)
+        edited = editor.edit(view, request.strength)
+        background = torch.tensor(request.background)
+        if not editor.is_confined and _repaints_surroundings(view, edited, background):
+            return view.confine(edited)
+        return edited
 
     def nearness(self, request: PreviewRequest) -> Nearness:
         """Estimate how close training will come to the editor's picture; "" for editors that are too slow.
@@ -278,6 +286,20 @@ class Previewer:
 def _options(request: PreviewRequest) -> EditorOptions:
     """Return the options of the request's editor."""
     return EditorOptions(request.editor, model=request.model, api_url=request.api_url, prompt=request.prompt)
+
+
+def _repaints_surroundings(view: View, edited: Tensor, background: Tensor) -> bool:
+    """Return True if most visible surroundings of the region are changed, as a filter of the picture does.
+
+    New paint beside the region, such as a hat, leaves most of them unchanged.
+    """
+    rows, columns = torch.nonzero(view.mask > 0.0, as_tuple=True)
+    box = torch.zeros_like(view.mask, dtype=torch.bool)
+    box[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+    drawn = (view.image - background).abs().amax(dim=2) > _VISIBLE_CHANGE
+    beside = box & drawn & (view.mask < 0.05)
+    changed = (edited - view.image).abs().amax(dim=2) > _VISIBLE_CHANGE
+    return int((beside & changed).sum()) > 0.5 * int(beside.sum())
 
 
 def _seen(request: PreviewRequest) -> PreviewRequest:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import queue
+import shlex
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import load_gdf
 from progdf.io.images import read_picture
+from tests.helpers.bare_run import EARS
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_pipelines import tiny_instruct_pix2pix
 from trainer.preview import NEAR_NOTES, Previewer, answer, draft_nearness, estimate, newest_line
@@ -101,6 +103,21 @@ def test_painting_does_not_depend_on_the_window_background(scene: Path, tmp_path
         assert answer(Previewer(scene, kept), line).error == ""
         made.append((kept / "view.png").read_bytes())
     assert made[0] == made[1] == made[2]
+
+
+def test_preview_of_a_filter_keeps_the_surroundings(scene: Path, tmp_path: Path) -> None:
+    program = (
+        "from PIL import Image; import sys; Image.open(sys.argv[1]).point(lambda x: x // 2).save(sys.argv[2])"
+    )
+    editor = f"command:{shlex.quote(sys.executable)} -c {shlex.quote(program)} {{input}} {{output}}"
+    previewer = Previewer(scene, tmp_path / "kept")
+    for number, strength in enumerate((0.0, 1.0)):
+        line = request(number, tmp_path, region=EARS, editor=editor, strength=strength)
+        assert answer(previewer, line).error == ""
+    original, edited = (read_picture(tmp_path / f"{number}.png") for number in range(2))
+    changed = (edited - original).abs().amax(dim=2) > 0.05
+    drawn = original.amin(dim=2) < 0.9
+    assert 0.05 < float(changed.sum() / drawn.sum()) < 0.6, "the region's pixels only"
 
 
 @pytest.mark.parametrize(("psnr", "near"), [(35.0, "close"), (25.0, "roughly"), (15.0, "far")])

@@ -461,8 +461,10 @@ def agree_views(
 
     def name_anchor(view: View) -> None:
         """Log the file of the anchor once it exists."""
-        path = None if easel.kept.folder is None else easel.kept.folder / ANCHOR / f"{view.camera.name}.png"
-        if path is not None and path.is_file():
+        if easel.kept.folder is None or not (follows or painter.has_start):
+            return
+        path = easel.kept.folder / ANCHOR / f"{view.camera.name}.png"
+        if path.is_file():
             log.say(f"all views follow {path}; to change the edit, paint over that picture and start again")
 
     with log.steps("edit", calls) as advance:
@@ -549,7 +551,8 @@ def measure_degrees(easel: PaintCache, view: View, finished: Tensor, log: RunLog
 def _plan(painter: FramePainter, views: int, anchors: int, rounds: int) -> str:
     """Return a description of the order of painting, for the log."""
     if painter.references:
-        order = f"{anchors} anchors, {views - anchors} views that follow"
+        followers = views - anchors
+        order = f"{anchors} anchors, {followers} view{'s that follow' if followers != 1 else ' that follows'}"
     elif painter.has_start:
         order = "one view after another"
     else:

@@ -488,7 +488,12 @@ def _move_keyboard_focus(workspace: Workspace, by: float) -> Workspace:
 
 
 def _new_edit(workspace: Workspace, _: None) -> Workspace:
-    """Open or close the form of a new edit. Its region defaults to the selection if there is one."""
+    """Open or close the form of a new edit. Its region defaults to the selection if there is one.
+
+    Closing keeps the settings, but not the name: the next edit is another one.
+    """
+    if workspace.form_open:
+        return replace(workspace, form=replace(workspace.form, name="", error=""), form_open=False)
     form = workspace.form
     selection = workspace.view.selection
     known = (ALL, TYPED, CHANGED, *(region.name for region in selection.regions))
@@ -496,8 +501,7 @@ def _new_edit(workspace: Workspace, _: None) -> Workspace:
         form = replace(form, region=SELECTION)
     elif form.region not in known:
         form = replace(form, region=ALL)
-    opens = not workspace.form_open
-    return replace(workspace, form=replace(form, error=""), form_open=opens, form_opening=opens)
+    return replace(workspace, form=replace(form, error=""), form_open=True, form_opening=True)
 
 
 GLIDES = ("frame", "home", "look")

@@ -16,6 +16,9 @@ from viewer.state.workspace import Message, Question
 from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
 from .widgets import plate
 
+_BANNER_PX = 14.0  # upper edge of a banner's text, at 1×
+_UNDER_BAR_PX = 52.0  # the same below a bar at the picture's upper edge
+
 
 @dataclass(frozen=True)
 class Area:
@@ -25,13 +28,17 @@ class Area:
     height: float
 
 
-def banner(text: str, area: Area, ui: UiContext) -> None:
-    """Draw a text at the top center of the picture."""
+def banner(text: str, area: Area, ui: UiContext, under_bar: bool = False) -> None:
+    """Draw a text at the top center of the picture.
+
+    Args:
+        under_bar: a bar of the tool or of the comparison is there; the text goes below it
+    """
     size = FONT_PX * ui.scale
     pad = 8.0 * ui.scale
     wide = _text_width(text, size, ui)
     x = (area.width - wide) / 2
-    y = 14.0 * ui.scale
+    y = (_UNDER_BAR_PX if under_bar else _BANNER_PX) * ui.scale
     corners = (x - 1.5 * pad, y - pad / 2), (x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)

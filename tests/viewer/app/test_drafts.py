@@ -353,6 +353,47 @@ def test_prompt_is_painted_on_request_and_the_edit_follows_it(
     assert f"--anchor={anchor}" in Trainer.said
 
 
+def test_saved_picture_covers_a_view_larger_than_its_preview(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viewer.app.parts.preview.open_in_program", lambda path: True)
+    Previews.grade = None
+    opened(window)
+    kind = next(i for i, choice in enumerate(EDITORS) if choice.kind == "instruct")
+    with_form(window, editor=kind, sentence="make it a statue", asks=1)
+    previewed = window.main_view.work.transient.cover
+    assert previewed is not None
+    request(window, Plain("paint_over"))
+    anchor = Path(window.main_view.work.form.anchor)
+    with Image.open(anchor) as picture:
+        assert picture.size != previewed.size, "a preview has fewer pixels than the view"
+        Image.new("RGB", picture.size, (200, 30, 30)).save(anchor)
+    turn(window)
+    saved = window.main_view.work.transient.cover
+    assert saved is not None
+    assert (saved.name, saved.camera, saved.size) == ("Painted", previewed.camera, previewed.size)
+
+
+def test_banner_of_a_preview_is_below_the_comparison_bar(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    under_bar = list[bool]()
+    monkeypatch.setattr(
+        "viewer.panel.pages.overlay.banner", lambda *_, **options: under_bar.append(options["under_bar"])
+    )
+    grade = Previews.grade
+    Previews.grade = None
+    opened(window, editor=2)
+    assert under_bar[-1:] == [False]
+    Previews.grade = grade
+    with_form(window, editor=0)
+    request(window, Plain("train"))
+    assert layer(window).name == "blue"
+    Previews.grade = None
+    opened(window, editor=2)
+    assert under_bar[-1:] == [True]
+
+
 def test_trained_edit_replaces_its_draft_and_nothing_else(
     window: application.App,
 ) -> None:

@@ -60,6 +60,16 @@ def test_again_opens_the_form_with_the_settings_of_the_edit(hand: Rig) -> None:
     assert perform(replace(work, view=view), OnItem("again", SCARF), named).form.region == "hands"
 
 
+def test_closed_form_keeps_its_settings_but_not_its_name(hand: Rig) -> None:
+    facts = of_edit(hand.main_view.facts, "tint:#ff0000", "all")
+    work = perform(hand.main_view.work, OnItem("again", SCARF), facts)
+    assert work.form.name == work.view.layers[SCARF].name
+    closed = perform(work, Plain("new_edit"), facts)
+    opened = perform(closed, Plain("new_edit"), facts)
+    assert (closed.form_open, opened.form_open, opened.form.name) == (False, True, "")
+    assert opened.form.spec == work.form.spec
+
+
 def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
     work = hand.main_view.work
     for instruction in (

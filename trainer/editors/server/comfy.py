@@ -207,7 +207,8 @@ class ComfyServer:
         """Return the JSON object of an answer."""
         if answer.status != 200:
             text = one_line(answer.content[:400].decode("utf-8", "replace"))
-            raise self.address.fault(f"is no ComfyUI: status {answer.status} ({text}); check --api-url")
+            reason = f" ({text})" if text else ""
+            raise self.address.fault(f"is no ComfyUI: status {answer.status}{reason}; check --api-url")
         try:
             value = json.loads(answer.content)
         except ValueError as error:

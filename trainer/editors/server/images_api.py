@@ -51,6 +51,7 @@ from .calls import (
 _CONNECT_TIMEOUT_S = 5.0  # wait for the answer that tells that a server is there
 _MAX_PICTURE_BYTES = 1 << 26  # largest picture of a server
 _SIZE = re.compile(r"\b(\d{2,5})\s*[x×]\s*(\d{2,5})\b")  # in the error messages of a server
+_NO_CREDIT = "insufficient_quota"  # code of status 429 that waiting does not change
 _REFUSALS = ("content_policy_violation", "moderation_blocked", "content_filter", "safety")
 
 
@@ -280,10 +281,15 @@ class ImagesApi:
             404: "check --api-url and --model",
             429: "wait, or use fewer --edit-workers",
         }.get(status, "check --model and --api-references")
+        if status >= 500:
+            advice = "look at its log"
+        if code == _NO_CREDIT:
+            advice = "add credit to the account of the key"
         if 300 <= status < 400:
             advice = "it redirects to another address; check --api-url"
-        fault = self.address.fault(f"refuses the call with status {status} ({message}); {advice}")
-        if status in BUSY_STATUSES and code != "insufficient_quota":
+        reason = "" if message == f"Error code: {status}" else f" ({message})"
+        fault = self.address.fault(f"refuses the call with status {status}{reason}; {advice}")
+        if status in BUSY_STATUSES and code != _NO_CREDIT:
             return BusyError(fault, retry_after(error.response.headers))
         sizes = named_sizes(str(body.get("message") or error.message), size)
         if status in (400, 422) and sizes:

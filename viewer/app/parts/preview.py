@@ -68,7 +68,8 @@ class PreviewedView:
 
     path: Path
     camera: ViewCamera  # camera of the view
-    size: tuple[int, int]  # pixels
+    view_size: tuple[int, int]  # size of the view on screen, pixels
+    size: tuple[int, int]  # size of the picture, pixels; a preview's is limited by `LONGEST_SIDE`
     state: tuple[int, int]  # state of the file at the last check, see `_file_state`
 
 
@@ -233,13 +234,15 @@ class PreviewActions:
         path = self._save_edited(folder, scene.stem)
         form = with_picture(self._store.get().form, path, further=False)
         self._store.replace(replace(self._store.get(), form=form, form_open=True))
-        self._open_painter(path, camera, size, None)
+        self._open_painter(PreviewedView(path, camera, size, size, _file_state(path)), None)
 
     def follow_anchor(self, path: Path) -> None:
         """Open a sentence's picture, written at `path`, in another program and show the saved result."""
         if self._pose is not None and self._painted is not None:
             height, width = self._painted[1].shape[:2]
-            self._open_painter(path, self._pose[1], (width, height), self._store.get().transient.cover)
+            _, camera, view_size = self._pose
+            picture = PreviewedView(path, camera, view_size, (width, height), _file_state(path))
+            self._open_painter(picture, self._store.get().transient.cover)
 
     def look_behind(self, path: Path) -> None:
         """Turn the view to the camera of a picture, and show the picture there until the view moves.
@@ -260,13 +263,11 @@ class PreviewActions:
         self._store.replace(with_camera(replace(work, form_open=False), view_camera))
         self._show("", self._behind)
 
-    def _open_painter(
-        self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None
-    ) -> None:
-        self._painting = PreviewedView(path, camera, size, _file_state(path))
+    def _open_painter(self, picture: PreviewedView, cover: Cover | None) -> None:
+        self._painting = picture
         self._show(PAINT_TEXT, cover)
-        if not open_in_program(path):
-            self._messages.show(f"No program for pictures was found. Open {path} in yours.")
+        if not open_in_program(picture.path):
+            self._messages.show(f"No program for pictures was found. Open {picture.path} in yours.")
 
     def _is_painting(self, painted: PreviewedView) -> bool:
         """Return whether the form uses the picture that is being painted."""
@@ -291,7 +292,7 @@ class PreviewActions:
             template = "{} has {}×{} pixels instead of {}×{}; save it at its original size"
             self._show(template.format(painted.path.name, width, height, *painted.size), None, failed=True)
         else:
-            cover = Cover(self._upload(pixels), painted.camera, painted.size, "Painted")
+            cover = Cover(self._upload(pixels), painted.camera, painted.view_size, "Painted")
             self._show("This is the saved picture. Train makes it an edit.", cover)
             self._store.wake()
         return WATCH_S
@@ -525,6 +526,8 @@ class PreviewActions:
                 else:
                     name = f"Example: {argument}"
                     text = "Example only, as this model follows no picture; no estimate for prompts"
+                if kind == "command":
+                    text = "Example: training runs the program on each view by itself"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._store.wake()
