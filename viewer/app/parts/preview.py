@@ -491,7 +491,7 @@ class PreviewActions:
             self._show(answer.error, None, failed=True, models=answer.models)
         elif self._sent is None or self._sent.kind != now.kind:
             return
-        elif answer.made == "palette":
+        elif answer.made == "palette" and answer.sample is not None:
             self._palette_of = self._sent.region
             self._looks_of = self._sent.camera
             self._grading.take(answer.sample, answer.palette, self._palette_of)
