@@ -38,7 +38,7 @@ def local_detail(scene: Gaussians, rows: Tensor) -> Tensor:
     colors = (scene.sh0[rows].float() * C0 + 0.5).nan_to_num(0.0).clamp(0, 1)
     lightness = srgb_to_oklab(colors)[:, 0].double().numpy()
     scales = scene.log_scales[rows].float().exp().sort(dim=1).values.double()
-    areas = (_limited(scales[:, 1]) * _limited(scales[:, 2])).numpy()
+    areas = (_limit_scales(scales[:, 1]) * _limit_scales(scales[:, 2])).numpy()
     weights = areas * scene.logit_opacities[rows].float().sigmoid().nan_to_num(0.0).double().numpy() + 1e-30
     points = scene.means[rows].double().nan_to_num(0.0, 0.0, 0.0).numpy()
     low, high = np.quantile(points, _MIDDLE, axis=0)
@@ -62,7 +62,7 @@ def local_detail(scene: Gaussians, rows: Tensor) -> Tensor:
     return torch.from_numpy((lightness - smooth).astype(np.float32))
 
 
-def _limited(scales: Tensor) -> Tensor:
+def _limit_scales(scales: Tensor) -> Tensor:
     """Return scales up to 100 times their median, so that no single Gaussian is the neighborhood. [M]"""
     finite = scales.nan_to_num(0.0, 0.0, 0.0)
     return finite.clamp_max(100.0 * float(finite.median()))

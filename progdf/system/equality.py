@@ -24,5 +24,5 @@ def equal_fields(first: Any, second: object) -> bool:
 
 
 @cache
-def _compared_names(kind: type) -> tuple[str, ...]:
+def _compared_names(kind: Any) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind) if field.compare)

@@ -49,7 +49,7 @@ class StackOptions:
     gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf|SCENE", "the scene alone")] = ()
     """Edits, the lowest layer first; .cube files, which change colors everywhere; further scenes."""
     place: Annotated[tuple[str, ...], UseAppendAction, word("NAME=X,Y,Z[,RX,RY,RZ[,SCALE]]")] = ()
-    """Place a scene: a shift, degrees about x, y and z in turn, a scale; see docs/cli.md#scenes."""
+    """Place a scene: a shift, degrees about x, y and z in turn, a scale; see docs/cli.md, Scenes."""
     region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()
     """Apply a grade (of any scene) or a .cube file to this region: all, or as for `progdf train`."""
     set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()

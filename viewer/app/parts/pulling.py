@@ -8,8 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -248,7 +247,7 @@ class PullActions:
                 continue
             if wait is None and not running:
                 return
-            wait_for(running)
+            wait(running)
 
     @property
     def _pull(self) -> Pull | None:
@@ -353,7 +352,7 @@ class PullActions:
                 raise
             return
         if self._stepping is not None:
-            wait_for([self._stepping])
+            wait([self._stepping])
             self._stepping = None
         engine = self._engine()
         if self._base is None:
@@ -398,7 +397,7 @@ class PullActions:
         if is_current and rest > 0.0:
             return rest  # the next movement need not wait for this step
         self._stepping = self._stepper.submit(_solve, prepared.live, pose)
-        wait_for([self._stepping], _PATIENCE_S)
+        wait([self._stepping], _PATIENCE_S)
         if self._stepping.done():
             self._take_step(prepared)
             return _REST_S
@@ -419,7 +418,7 @@ class PullActions:
     def _clear(self) -> None:
         """Draw the scene without the pull."""
         if self._stepping is not None:
-            wait_for([self._stepping])
+            wait([self._stepping])
         base = self._base
         if base is not None and base[0] is self._engine():
             base[0].adopt(base[1], base[2])
