@@ -14,15 +14,14 @@ def equal_fields(first: Any, second: object) -> bool:
     3.12 Python does this by itself, because it compares tuples of the fields. From 3.13 on it compares field
     by field, which raises for the same array, too.
     """
-    kind: Any = type(first)
     if first is second:
         return True
-    if type(second) is not kind:
+    if type(second) is not type(first):
         return NotImplemented  # type: ignore[no-any-return]  # an operator's answer, which Python replaces
-    names = _compared_names(kind)
+    names = _compared_names(type(first))
     return tuple(getattr(first, name) for name in names) == tuple(getattr(second, name) for name in names)
 
 
 @cache
-def _compared_names(kind: Any) -> tuple[str, ...]:
+def _compared_names(kind: type[Any]) -> tuple[str, ...]:
     return tuple(field.name for field in fields(kind) if field.compare)

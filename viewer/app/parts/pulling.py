@@ -236,7 +236,7 @@ class PullActions:
         """Wait until the window shows the pull of the current handles."""
         while True:
             self._solved_at = 0.0
-            wait = self.poll()
+            delay = self.poll()
             running = list[Future[Any]]()
             if self._preparing is not None:
                 running.append(self._preparing[1])
@@ -245,7 +245,7 @@ class PullActions:
             if self._keeping:
                 self._maker.wait()
                 continue
-            if wait is None and not running:
+            if delay is None and not running:
                 return
             wait(running)
 
