@@ -16,9 +16,10 @@ def equal_fields(first: Any, second: object) -> bool:
     """
     if first is second:
         return True
-    if type(second) is not type(first):
+    kind: Any = type(first)
+    names = _compared_names(kind)
+    if type(second) is not kind:
         return NotImplemented  # type: ignore[no-any-return]  # an operator's answer, which Python replaces
-    names = _compared_names(type(first))
     return tuple(getattr(first, name) for name in names) == tuple(getattr(second, name) for name in names)
 
 
