@@ -1,8 +1,7 @@
 """The command `python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
 
 `python -m benchmarks ablate RUN …` trains finished runs again without each part of the method. `python -m
-benchmarks sliders FOLDER` trains edits whose pictures are known at every strength. `python -m benchmarks
-page` fills docs/speed-and-error.md. Wall times are left out if other processes use the cores.
+benchmarks page` fills docs/speed-and-error.md. Wall times are left out if other processes use the cores.
 """
 
 from __future__ import annotations
@@ -89,15 +88,13 @@ class BenchOptions:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the named benchmarks, the ablation, the sliders, the sweep or the stages.
+    """Run the named benchmarks, the ablation, the sweep or the stages.
 
     Raises:
         ProgdfError: a name, file or folder does not exist, or an option does not fit the named benchmarks.
     """
     if list(argv[:1]) == ["ablate"]:
         return ablate(argv[1:])
-    if list(argv[:1]) == ["sliders"]:
-        return sliders(argv[1:])
     if list(argv[:1]) == ["regret"]:
         return regret(argv[1:])
     if list(argv[:1]) == ["training-stages"]:
@@ -110,7 +107,7 @@ def main(argv: Sequence[str]) -> int:
         if name not in BENCHES:
             raise ProgdfError(
                 f"unknown benchmark '{name}'; use one of "
-                f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret', 'training-stages'))}"
+                f"{', '.join((*BENCHES, 'page', 'ablate', 'regret', 'training-stages'))}"
             )
     charted = ("training", "field")
     plotted = (*charted, "recolors", "subject")
@@ -220,14 +217,6 @@ def ablate(argv: Sequence[str]) -> int:
 
     for ablation in run(parse_options(AblateOptions, argv, f"{COMMAND} ablate")):
         print_table(ablation)
-    return 0
-
-
-def sliders(argv: Sequence[str]) -> int:
-    """Compare sliders with known pictures and return 0. Raises ProgdfError for errors the user can fix."""
-    from .sliders import SliderOptions, run_sliders
-
-    run_sliders(parse_options(SliderOptions, argv, f"{COMMAND} sliders"))
     return 0
 
 

@@ -17,8 +17,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.rasterize import alpha_weights, render
 from progdf.region import from_mask
-
-from .analytic_edits import AnalyticEdit
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit
 
 
 @dataclass(frozen=True)

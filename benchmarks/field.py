@@ -42,12 +42,12 @@ from progdf.gdf.file import Gdf
 from progdf.metrics.image import decibels
 from progdf.rasterize import set_threads
 from progdf.threads import threads
+from trainer.evaluate.suite.analytic_edits import bear_edits
 from trainer.fit.keyframes import TwoKeyframes
 from trainer.optimize.color_solver import make_solver
 from trainer.optimize.color_views import add_bands
 
 from .ablation.regret import MEASURED, REPORTING, RegretEdit
-from .analytic_edits import bear_edits
 from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks

@@ -34,7 +34,7 @@ DOCUMENTS = [
     *PAGES,
     *(path for name in FOLDERS for path in sorted((ROOT / "docs" / name).glob("*.md")) if path not in PAGES),
 ]
-OWN_BENCHMARKS = ("ablate", "sliders", "regret", "training-stages")
+OWN_BENCHMARKS = ("ablate", "regret", "training-stages")
 """Benchmarks with options of their own."""
 
 MAX_README_LINES = 150

@@ -38,8 +38,8 @@ ORDER = {
     "trainer": """__init__ options quality store views paint fill editors resolve regions
         motion optimize paper fit methods report preview run evaluate batch cli""",
     "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",
-    "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
-        recorded_runs viewer colors layers files field edits networks sliders motion pictures spill
+    "benchmarks": """__init__ analytic_warps courses table ablation rasterizer training
+        recorded_runs viewer colors layers files field edits networks motion pictures spill
         editors __main__""",
 }
 

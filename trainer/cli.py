@@ -73,6 +73,11 @@ def fit(argv: Sequence[str]) -> int:
 def evaluate(argv: Sequence[str]) -> int:
     """Run `progdf evaluate`; return 0 when all is measured. Raises ProgdfError for user errors."""
     options = parse_options(EvaluateOptions, argv, "progdf evaluate")
+    if options.suite is not None:
+        from trainer.evaluate.suite.run import evaluate_suite
+
+        evaluate_suite(options)
+        return 0
     from trainer.evaluate.command import evaluate as run
 
     run(options)

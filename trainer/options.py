@@ -356,10 +356,16 @@ class FitOptions:
 @dataclass(frozen=True)
 @tyro.conf.configure(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
 class EvaluateOptions:
-    """Measure a finished run as papers do: one table and one picture, on held-out views."""
+    """Measure a finished run as papers do, or compare methods on edits with known pictures."""
 
     run: tyro.conf.Positional[Path]
-    """Folder of a run of progdf train or progdf batch."""
+    """Folder of a run of progdf train or progdf batch; with --suite a folder for its files."""
+    suite: Annotated[Literal["sliders"] | None, absent_option("sliders", "measure a run")] = None
+    """Train and compare methods on ten edits whose pictures are known at every strength."""
+    methods: Annotated[tuple[str, ...], absent_option("NAME", "field keyframes matrix")] = ()
+    """--suite: field, keyframes, matrix, paper, or your own function as package.module:function."""
+    seed: int = 0
+    """--suite: random seed of the trainings, 0 to 2³² − 1."""
     scene: Annotated[Path | None, absent_option("PATH", "where the run found it")] = None
     """Current path of the scene, if it has moved since the run."""
     texts: TextOptions = TextOptions()

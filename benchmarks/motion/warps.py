@@ -24,6 +24,7 @@ from progdf.rasterize import render
 from progdf.region import Region, from_mask
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import make_editor
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
 from trainer.optimize.losses import Objective, perceptual_loss
@@ -37,7 +38,7 @@ from trainer.views.crops import CropScene, crop_scene
 from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import View, crop
 
-from ..analytic_edits import AnalyticEdit, column_warps, smile_warp
+from ..analytic_warps import column_warps, smile_warp
 from ..table import Table
 
 STEPS = 240

@@ -33,7 +33,7 @@ from tests.helpers.image_server import image_server
 from tests.helpers.null_app import null_platform
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import orbit_camera
-from tests.helpers.small_benchmarks import shrink_benchmarks, shrink_demo
+from tests.helpers.small_benchmarks import shrink_benchmarks, shrink_demo, shrink_suite
 from tests.helpers.stopped_runs import at_step
 from tests.helpers.trained import quick_options
 from viewer.app.app import App
@@ -299,14 +299,15 @@ def test_every_exception_is_still_documented() -> None:
         pytest.param(
             example,
             id=f"{example.document}, {example.heading}",
-            marks=[pytest.mark.slow] if "trainer.batch" in example.text else [],
+            marks=[pytest.mark.slow] if re.search("trainer.batch|run_suite", example.text) else [],
         )
         for example in python_examples()
         if example.document
         != "docs/recipes.md"  # tests/docs/test_recipes.py runs these and checks the results
     ],
 )
-def test_documented_python_block_runs(here: Path, example: Example) -> None:
+def test_documented_python_block_runs(here: Path, example: Example, monkeypatch: pytest.MonkeyPatch) -> None:
+    shrink_suite(monkeypatch)
     camera: Camera = orbit_camera()
     given = {
         "__name__": "example",

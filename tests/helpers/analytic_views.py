@@ -18,13 +18,13 @@ import numpy as np
 import torch
 import tyro
 
-from benchmarks.analytic_edits import AnalyticEdit, bear_edits, scale_edit
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
 from progdf.rasterize import render
 from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit, bear_edits, scale_edit
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions
 from trainer.resolve import resolve
 from trainer.views.setup import make_training_setup

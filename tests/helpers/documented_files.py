@@ -71,6 +71,12 @@ region = "labels:shoes/left_labels.npy:1"
 editor = "recolor:#3060d0"
 """
 
+METHOD = """
+def slider(task):
+    return lambda strength: task.scene
+"""
+"""Module with a method of the suite `sliders`."""
+
 
 def write_documented_files() -> None:
     """Write scenes, labels, cameras, edits, pictures, a session and a catalogue."""
@@ -93,6 +99,7 @@ def write_documented_files() -> None:
     _write_pictures(demo)
     _write_session(demo.gaussians)
     Path("catalogue.toml").write_text(CATALOGUE, encoding="utf-8")
+    Path("my_method.py").write_text(METHOD, encoding="utf-8")
     _write_program()
 
 

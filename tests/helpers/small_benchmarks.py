@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks import edits as run_edits
-from benchmarks import field, rasterizer, sliders, table, training
+from benchmarks import field, rasterizer, table, training
 from benchmarks.ablation import regret, setup
-from benchmarks.analytic_edits import column_warps
+from benchmarks.analytic_warps import column_warps
 from benchmarks.colors import packing, stages
 from benchmarks.editors import ideal_editors
 from benchmarks.files import exports
@@ -25,6 +25,7 @@ from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
 from tests.helpers import demo_scenes, drawn
+from trainer.evaluate.suite import run as suite
 from trainer.options import TrainingViewOptions
 from trainer.run import demo
 from trainer.run.demo import Effort
@@ -112,14 +113,15 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(setup, "QUICK_STEPS", 4)
     patch.setattr(setup, "QUICK_STAGES", 2)
     patch.setattr(setup, "QUICK_VIEWS", 4)
-    blue = next(case for case in sliders.CASES if case.name == "blue scarf")
-    small = partial(
-        sliders.run_suite,
-        cases=(blue,),
-        sizes={"bear": 1000, "room": 1000},
-        effort=Effort(views=4, image_size=48, steps=32),
-    )
-    patch.setattr(sliders, "run_suite", small)
+    shrink_suite(patch)
+
+
+def shrink_suite(patch: pytest.MonkeyPatch) -> None:
+    """Make `progdf evaluate --suite sliders` take seconds: one edit of a small bear."""
+    blue = next(edit for edit in suite.EDITS if edit.name == "blue scarf")
+    patch.setattr(suite, "EDITS", (blue,))
+    patch.setattr(suite, "SIZES", {"bear": 1000})
+    patch.setattr(suite, "EFFORT", Effort(views=6, image_size=48, steps=32))
 
 
 _tasks = training.tasks

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import analytic_edits
 from progdf import demo_scenes as scenes
 from progdf.color.edits import typical_color
 from progdf.demo_scenes import surface
@@ -19,6 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb
+from trainer.evaluate.suite import analytic_edits
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.terminal import print_line
 from trainer.optimize.losses import Perceptual, perceptual_loss
@@ -126,6 +127,8 @@ def evaluate(options: EvaluateOptions) -> list[Evaluation]:
         ProgdfError: the folder is not a finished run, one of its files is damaged, or its scene is missing or
             differs.
     """
+    if options.methods or options.seed:
+        raise ProgdfError("--methods and --seed belong to a suite; add --suite sliders")
     prepare_process(options.threads)
     perceptual, warning = perceptual_loss()
     if warning:

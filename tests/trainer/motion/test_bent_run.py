@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.analytic_edits import column_warps
+from benchmarks.analytic_warps import column_warps
 from tests.helpers.analytic_views import Truth, write_analytic_views, write_truth
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options, train

@@ -9,11 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.analytic_edits import AnalyticEdit, bend_warp, stretch_warp, warp_edit
+from benchmarks.analytic_warps import bend_warp, stretch_warp
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from progdf.similarity import Motion, make_parts, move_rows
 from tests.helpers.trained import WHITE, Small, small
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit, warp_edit
 from trainer.motion.parts import connected_parts
 from trainer.motion.warp import (
     ControlPoints,

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.analytic_edits import AnalyticEdit, scale_edit, swing_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.quaternions import rotate_vectors, turn_quats
 from progdf.rasterize import render
@@ -25,6 +24,7 @@ from progdf.similarity import (
 )
 from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
 from tests.helpers.trained import WHITE, Small, quick_options, small, train
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit, scale_edit, swing_edit
 from trainer.motion.parts import GroupSearch, connected_parts
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import GradientL1, Objective

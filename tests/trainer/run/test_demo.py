@@ -15,7 +15,6 @@ from PIL import Image
 
 import trainer.run.resume
 import trainer.run.run
-from benchmarks import analytic_edits
 from progdf import demo_scenes as scenes
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
@@ -28,6 +27,7 @@ from progdf.io.picture_camera import find_picture_camera
 from progdf.region import from_labels
 from progdf.scene.regions import parse_region
 from tests.helpers import demo_scenes
+from trainer.evaluate.suite import analytic_edits
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
 from trainer.run import demo

@@ -10,12 +10,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.analytic_edits import AnalyticEdit, bear_edits
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
+from trainer.evaluate.suite.analytic_edits import AnalyticEdit, bear_edits
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.kinds import Approach, Trial, approaches, choose_approach, try_approaches

@@ -1,0 +1,1 @@
+"""The suite `sliders`: methods compared on edits whose pictures are known at every strength."""
