@@ -20,6 +20,7 @@ from progdf.formats.ply import load_ply
 from progdf.gaussians import Gaussians
 from progdf.metrics.slider import Pictures
 from progdf.region import Region
+from progdf.system.equality import equal_fields
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.options import EditorOptions, TrainingViewOptions
@@ -82,13 +83,14 @@ EDITS = (
 class EditTask:
     """One edit as a method receives it."""
 
+    __eq__ = equal_fields
+
     name: str  # name of the edit
     scene: Gaussians  # the original
     region: Region  # the Gaussians that the edit changes
     views: Sequence[View]  # training views of the original: cameras, images and the region's weights
-    pictures: Mapping[
-        float, Sequence[Tensor]
-    ]  # strength → edited pictures of the views, 8 bits. [H,W,3] each
+    # strength → edited pictures of the views, 8 bits. [H,W,3] each
+    pictures: Mapping[float, Sequence[Tensor]]
     background: Tensor  # color behind the scene, rgb, 0 to 1. [3]
     scene_file: Path  # .ply of the same scene
     folder: Path  # folder for files of the method, maybe from an earlier call with the same task
@@ -100,6 +102,8 @@ class EditTask:
 @dataclass(frozen=True)
 class KnownTruth:
     """Held-out views of one edit, with their true pictures."""
+
+    __eq__ = equal_fields
 
     evaluator: Evaluator  # the views' boxes and the evaluated pixels
     views: Sequence[View]  # the same views
