@@ -155,8 +155,10 @@ def kill_group(process: subprocess.Popen[bytes]) -> None:
         return
     if sys.platform == "win32":
         command = ["taskkill", "/T", "/F", "/PID", str(process.pid)]
-        with suppress(OSError):
+        try:
             subprocess.run(command, capture_output=True, check=False)
+        except OSError:
+            process.kill()  # taskkill is missing
         return
     with suppress(OSError):
         if hasattr(os, "killpg"):

@@ -220,7 +220,7 @@ def _software() -> dict[str, str]:
         "progdf": progdf.__version__,
         "interpreter": platform.python_version(),
         **{name: version(name) for name in ("torch", "numba", "numpy")},
-        "system": platform.system(),
+        "system": platform.platform(terse=True),
         "machine": platform.machine(),
         "cores": str(os.cpu_count()),
     }
