@@ -148,6 +148,7 @@ class Canvas:
         """Number of pictures drawn."""
         self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
         self._last: tuple[object, object] = ((), ())  # last drawn: camera and size, edits
+        self.compares_grade = False  # the original is shown to compare it with the form's grade
         self._sliding = False  # the current drag changes the edits
         self._awaited: object = None  # key of the picture being drawn while the last one stays on screen
         self._begun: tuple[ViewState, tuple[int, int]] | None = None  # view and size of an unfinished picture
@@ -197,8 +198,9 @@ class Canvas:
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
         looks = self._sliding or live
+        graded = self.compares_grade or engine.live is not None
         self.comparer.engine.highlight = highlight.requested_highlight(
-            view, focus, pointed, looks, pulled, guessed
+            view, focus, pointed, looks, pulled, guessed, graded
         )
         target = aim, edits, self.comparer.engine.highlight
         has_picture = self.pictures_drawn or self._follows

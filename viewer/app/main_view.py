@@ -282,6 +282,7 @@ class MainView:
         pulled = None if pull is None else pull.influence
         focus = self.work.focus
         guessed = select_tool.guessed_rows(self.work)
+        self.canvas.compares_grade = self.work.form_open and self.work.before
         self.canvas.draw(
             view, screen, area, held, self._clock, focus, pointed, live, pulled=pulled, guessed=guessed
         )

@@ -58,14 +58,15 @@ def requested_highlight(
     looks: bool = False,
     pulled: PullInfluence | None = None,
     guessed: bytes = EMPTY_MASK,
+    graded: bool = False,
 ) -> Highlight | None:
     """Return the highlight for a view, or None.
 
     It shows the layer under the mouse in the panel, else painted weights while the brush is active, else the
     selection and the visible regions. Comparisons have no highlight, and invisible layers show no weights.
 
-    The selection is faint while no selection tool is active. It is invisible while the panel is hidden or
-    edits are being changed. The engine adds hidden Gaussians itself.
+    The selection is faint while no selection tool is active. It is invisible while the panel is hidden,
+    edits are being changed, or the form's grade is in the picture. The engine adds hidden Gaussians itself.
 
     Args:
         view: the state
@@ -74,6 +75,7 @@ def requested_highlight(
         looks: edits are being changed, so the selection is not shown
         pulled: Gaussians that a handle moves right now, or None
         guessed: selected Gaussians that no view with a scribble shows, packed
+        graded: the form's grade is in the picture, so that a tint would falsify its colors
     """
     if view.compare.mode != "off":
         return None
@@ -93,8 +95,9 @@ def requested_highlight(
         for i, region in enumerate(state.regions)
         if region.visible or (kind, index) == ("region", i)
     ]
-    strong = bool(view.select.tool) or kind == "selection"
-    if state.count and (strong or (view.panel and not looks)):
+    strong = kind == "selection" or (bool(view.select.tool) and not graded)
+    faint = view.panel and not (looks or graded)
+    if state.count and (strong or faint):
         tinted.append((state.members, SELECTED, TINT if strong else FAINT_TINT))
         if guessed != EMPTY_MASK:
             tinted.append((guessed, GUESSED, TINT))

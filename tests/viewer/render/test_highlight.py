@@ -172,6 +172,10 @@ def test_selection_has_a_full_tint_with_a_tool_and_a_trace_without(ctx: moderngl
     tinted = highlight.requested_highlight(replace(still, select=SelectTool("lasso")), 0)
     assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TINT),))
     assert highlight.requested_highlight(still, 0, ("selection", 0)) == tinted
+    with_tool = replace(still, select=SelectTool("lasso"))
+    for graded in (still, with_tool):
+        assert highlight.requested_highlight(graded, 0, graded=True) is None, "a tint falsifies the grade"
+    assert highlight.requested_highlight(still, 0, ("selection", 0), graded=True) == tinted
     assert highlight.requested_highlight(still, 0, ("layer", SCARF)) == Highlight(region=SCARF)
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     engine.highlight = tinted
