@@ -18,7 +18,7 @@ from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
 from viewer.camera.views import look_at_view
-from viewer.state.forms import ALL, CHANGED, SELECTION, TYPED, with_settings
+from viewer.state.forms import ALL, CHANGED, EDITORS, SELECTION, TYPED, with_editor, with_settings
 
 from . import history, layer_selection, paint, selection, snapshots, timeline
 from .commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, Plain, Rename, WithValue, argument
@@ -504,6 +504,13 @@ def _new_edit(workspace: Workspace, _: None) -> Workspace:
     return replace(workspace, form=replace(form, error=""), form_open=True, form_opening=True)
 
 
+def _new_grade(workspace: Workspace, _: None) -> Workspace:
+    """Open the form with a grade."""
+    opened = workspace if workspace.form_open else _new_edit(workspace, None)
+    grade = next(i for i, choice in enumerate(EDITORS) if choice.kind == "grade")
+    return replace(opened, form=with_editor(opened.form, grade), form_opening=True)
+
+
 GLIDES = ("frame", "home", "look")
 """Names of the commands whose camera move is animated as a glide."""
 ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
@@ -583,6 +590,7 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)) if w.snapshots else w,
     "dynamic_resolution": lambda w, _: _next_value(w, "dynamic_resolution", RESOLUTION_MODES),
     "new_edit": _new_edit,
+    "new_grade": _new_grade,
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
 }
 """Handlers of all other commands; each receives the workspace and the command's `argument`."""

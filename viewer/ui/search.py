@@ -7,8 +7,10 @@ from collections.abc import Collection
 from .keys import TOPICS, Command, chords
 
 WORDS = {
-    "new_edit": "hue, recolor, color, colour, saturation, brightness, contrast, exposure, grade, tint, "
-    "style, prompt, layer, add layer, new layer, filter, AI, generate, texture, material",
+    "new_edit": "hue, recolor, color, colour, tint, style, prompt, layer, add layer, new layer, filter, AI, "
+    "generate, texture, material",
+    "new_grade": "grade, color grading, hue, saturation, brightness, contrast, exposure, white balance, "
+    "temperature, vibrance, shadows, highlights, curve, color wheels, look",
     "open": "LUT, cube, import, load, drop",
     "add_scene": "merge, second, combine, import, append",
     "fold": "opacity, transparency, alpha, fade, gain",

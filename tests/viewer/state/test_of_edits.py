@@ -70,6 +70,13 @@ def test_closed_form_keeps_its_settings_but_not_its_name(hand: Rig) -> None:
     assert opened.form.spec == work.form.spec
 
 
+def test_new_grade_opens_the_form_with_a_grade(hand: Rig) -> None:
+    work = hand.main_view.work
+    opened = perform(work, Plain("new_grade"), hand.main_view.facts)
+    assert (opened.form_open, opened.form.choice.kind) == (True, "grade")
+    assert perform(opened, Plain("new_grade"), hand.main_view.facts).form_open
+
+
 def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
     work = hand.main_view.work
     for instruction in (
