@@ -141,7 +141,7 @@ def draw_decal(
         draw_mesh(moved.texture, moved.mesh, pointer)
     else:
         _draw_flat(moved, pointer)
-    overlay.banner(_hint(moved, surfaces), pointer.area, pointer.ui)
+    overlay.banner(_hint(moved, surfaces), pointer.area, pointer.ui, under_bar=pointer.shown.has_tool)
     if enters or (_is_over(pointer) and imgui.is_mouse_clicked(0)):
         moved = set_decal(moved, pointer, surfaces)
     return moved, ""

@@ -525,8 +525,8 @@ class Transient:
 
     @property
     def has_bar(self) -> bool:
-        """True if what is moved, pulled or placed has its own bar above the picture."""
-        return self.gizmo.placed if isinstance(self.gizmo, Decal) else self.gizmo is not None
+        """True if a part is moved or pulled or a decal placed, with its own bar above the picture."""
+        return self.gizmo is not None
 
     @property
     def held_pull(self) -> Pull | None:

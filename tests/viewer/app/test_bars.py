@@ -57,8 +57,8 @@ def bars() -> dict[str, Box]:
     }
 
 
-def place_decal(app: App, folder: Path) -> None:
-    """Take a picture in hand as if it had just been placed in the middle of the bear."""
+def hold_decal(app: App, folder: Path) -> None:
+    """Take a picture in hand, which follows the pointer in the middle of the bear."""
     pixels = np.zeros((40, 80, 4), np.uint8)
     pixels[10:30, 20:60] = 200, 30, 30, 255
     Image.fromarray(pixels).save(folder / "logo.png")
@@ -67,6 +67,11 @@ def place_decal(app: App, folder: Path) -> None:
     wide, tall = app.main_view.picture_size
     imgui.get_io().add_mouse_pos_event(wide / 2, tall / 2)
     rest(app)
+
+
+def place_decal(app: App, folder: Path) -> None:
+    """Take a picture in hand as if it had just been placed in the middle of the bear."""
+    hold_decal(app, folder)
     press(app, "Enter")
     until_placed(app)
 
@@ -114,3 +119,11 @@ def test_no_bar_covers_another(app: App, folder: Path, size: str) -> None:
             is_beside = one[2] <= other[0] + 1 or other[2] <= one[0] + 1
             is_above = one[3] <= other[1] + 1 or other[3] <= one[1] + 1
             assert is_beside or is_above, (state, name, one, other_name, other)
+
+
+def test_no_bar_covers_the_instruction_for_a_decal(app: App, folder: Path) -> None:
+    press(app, "Ctrl+A")
+    rest(app)
+    assert {"comparison", "options"} <= set(bars())
+    hold_decal(app, folder)
+    assert not {"comparison", "options"} & set(bars())
