@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui, imgui_ctx
@@ -17,6 +17,8 @@ from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
 from .widgets import plate
 
 _BANNER_PX = 14.0  # upper edge of a banner's text, at 1×
+_BANNER_SIDE_PX = 114.0  # free width at each side of a banner, for the toolbar and the axes
+_LINE_HEIGHT = 1.25  # distance of a banner's lines relative to the size of its text
 _UNDER_BAR_PX = 52.0  # the same below a bar at the picture's upper edge
 
 
@@ -29,19 +31,42 @@ class Area:
 
 
 def banner(text: str, area: Area, ui: UiContext, under_bar: bool = False) -> None:
-    """Draw a text at the top center of the picture.
+    """Draw a text at the top center of the picture, on several lines if the picture is narrow.
 
     Args:
         under_bar: a bar of the tool or of the comparison is there; the text goes below it
     """
     size = FONT_PX * ui.scale
     pad = 8.0 * ui.scale
-    wide = _text_width(text, size, ui)
-    x = (area.width - wide) / 2
+    room = area.width - 2 * _BANNER_SIDE_PX * ui.scale
+    lines = wrap_words(text, room, lambda line: _text_width(line, size, ui))
+    widths = [_text_width(line, size, ui) for line in lines]
+    height = _LINE_HEIGHT * size
     y = (_UNDER_BAR_PX if under_bar else _BANNER_PX) * ui.scale
-    corners = (x - 1.5 * pad, y - pad / 2), (x + wide + 1.5 * pad, y + size + pad / 2)
+    left = (area.width - max(widths)) / 2 - 1.5 * pad
+    bottom = y + (len(lines) - 1) * height + size + pad / 2
+    corners = (left, y - pad / 2), (area.width - left, bottom)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
-    _text(x, y, text, size, PALETTE.text, ui)
+    for i, (line, wide) in enumerate(zip(lines, widths, strict=True)):
+        _text((area.width - wide) / 2, y + i * height, line, size, PALETTE.text, ui)
+
+
+def wrap_words(text: str, room: float, width: Callable[[str], float]) -> list[str]:
+    """Return the lines of a text. Only a line of a single word may be wider than `room`.
+
+    Args:
+        text: the text
+        room: largest width, window pixels
+        width: returns the width of a line, window pixels
+    """
+    lines = [""]
+    for word in text.split(" "):
+        longer = f"{lines[-1]} {word}"
+        if lines[-1] and width(longer) > room:
+            lines.append(word)
+        else:
+            lines[-1] = longer.lstrip()
+    return [line.rstrip() for line in lines]
 
 
 def safe_frame(view: ViewState, area: Area, covered: float = 0.0) -> Area | None:

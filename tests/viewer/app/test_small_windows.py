@@ -15,6 +15,7 @@ from viewer.files.document import Document
 from viewer.panel import panel, timeline_bar
 from viewer.state import workspace
 from viewer.state.workspace import Dialog, with_transient
+from viewer.ui import overlay
 
 pytestmark = pytest.mark.gl
 SMALLEST = (640, 400)
@@ -94,3 +95,12 @@ def test_home_view_uses_the_first_camera_with_the_same_up_axis() -> None:
     scene = bear().scene
     first = first_camera(scene)
     assert Document("bear.ply", scene).facts().home(ViewCamera(up=first.up), 1.5) == first
+
+
+def test_banner_breaks_between_words_where_it_is_too_wide() -> None:
+    text = "200 px   Click: place. Shift+wheel: rotate, with Ctrl in steps"
+    wrapped = overlay.wrap_words(text, 20.0, len)
+    assert " ".join(wrapped).split() == text.split()
+    assert max(map(len, wrapped)) <= 20
+    assert overlay.wrap_words(text, 100.0, len) == [text]
+    assert overlay.wrap_words(text, 0.0, len) == text.split()
