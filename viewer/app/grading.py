@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -21,6 +22,7 @@ from viewer.files.document import DocumentStore
 from viewer.jobs.preview_process import RegionSample
 from viewer.render.engine import ViewEngine
 from viewer.render.live_grade import FormGrader, LiveGrade
+from viewer.state.commands import Plain
 from viewer.state.forms import LOOK_COLUMNS, LOOK_PX, with_settings
 from viewer.state.transient import LookShelf
 from viewer.state.workspace import Store, with_transient
@@ -62,7 +64,12 @@ class GradePreview:
     @property
     def requests(self) -> Requests:
         """Handlers of the requests about grades, by name."""
-        return {"copy_edit": self._copy, "paste_edit": self._paste, "save_look": self._save_look}
+        return {
+            "copy_edit": self._copy,
+            "paste_edit": self._paste,
+            "save_look": self._save_look,
+            "show_looks": self._show_looks,
+        }
 
     def region_key(self) -> str:
         """Return the form's region as a key."""
@@ -96,6 +103,8 @@ class GradePreview:
             live = self._grader.live(form)
             self._update_scope(live)
             self._update_shelf()
+        else:
+            self._looks = None
         shown = live if form.preview and not work.before else None
         engine = self._engine()
         if engine.live != shown:
@@ -150,6 +159,8 @@ class GradePreview:
                 *user_files.read_looks(),
                 *((name, f"grade:{settings}") for name, settings in BUILT_IN.items()),
             )
+            if self._drawn is not None and self._drawn[1] == self._looks:
+                self._looks = self._drawn[1]  # so that the thumbnails stay
         sample = self._grader.sample
         if sample is None:
             if self._store.get().transient.shelf.looks != self._looks:
@@ -193,8 +204,19 @@ class GradePreview:
         write_cube(path, grade_fully(lattice_colors(SIDE).float(), grade), path.stem, settings)
         self._looks = None
         note = "; other programs read it without clarity" if grade.clarity else ""
-        self._messages.show(f"Saved the look {look_name(path.stem)} as {path}{note}")
+        line = f"Saved the look {look_name(path.stem)} as {path}{note}"
+        self._messages.show(line, button=("Show folder", Plain("show_looks")))
         self._store.wake()
+
+    def _show_looks(self, _: None) -> None:
+        """Show the folder of the looks, where files are renamed and deleted.
+
+        Raises:
+            ProgdfError: the folder cannot be created.
+        """
+        folder = user_files.looks_folder()
+        make_folder(folder)
+        webbrowser.open(folder.as_uri())
 
     def _copy(self, index: int | None) -> None:
         """Copy the settings of an edit as text.

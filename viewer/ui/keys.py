@@ -292,6 +292,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("compare_snapshots", "Compare snapshots", "Shift+F5", "Snapshot A against B", row=JOINED),
         Command("new_edit", "New edit…", "Ctrl+N", "Choose region and editor, preview, train", types=True),
         Command("new_grade", "New grade…", "", "Light, color, wheels, curves and looks", types=True),
+        Command("show_looks", "Show looks folder", "", "To rename, delete and add looks of grades"),
         Command("save", "Save session", "Ctrl+S", types=True, row="Save session; Shift as…"),
         Command("save_as", "Save session as…", "Ctrl+Shift+S", types=True, row=JOINED),
         Command("open", "Open…", "Ctrl+O", "A scene, a session or an edit", types=True),

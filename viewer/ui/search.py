@@ -11,6 +11,7 @@ WORDS = {
     "generate, texture, material",
     "new_grade": "grade, color grading, hue, saturation, brightness, contrast, exposure, white balance, "
     "temperature, vibrance, shadows, highlights, curve, color wheels, look",
+    "show_looks": "rename look, delete look, presets, LUT folder",
     "open": "LUT, cube, import, load, drop",
     "add_scene": "merge, second, combine, import, append",
     "fold": "opacity, transparency, alpha, fade, gain",

@@ -14,6 +14,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.compose import layer_paint
+from progdf.field.baked import lattice_colors
+from progdf.formats.cube import write_cube
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.picture_camera import camera_chunk, find_picture_camera
 from tests.helpers.null_app import null_app, press
@@ -23,6 +25,7 @@ from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
 from viewer.app.parts import preview
 from viewer.camera.view_camera import to_camera
+from viewer.files import user_files
 from viewer.files.session import open_session
 from viewer.jobs import job_queue, preview_process
 from viewer.state.commands import OnItem, Plain
@@ -477,3 +480,21 @@ def test_draft_of_the_run_becomes_the_layer_without_a_preview(window: applicatio
     Trainer.ended = 0
     turn(window)
     assert [path.name for path in window.documents.get().gdf_paths] == ["blue.gdf"]
+
+
+def test_form_reads_the_folder_of_looks_each_time_it_opens(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "looks"
+    folder.mkdir()
+    monkeypatch.setattr(user_files, "looks_folder", lambda: folder)
+    table = lattice_colors(2).float()
+    write_cube(folder / "old.cube", table, "old", "exposure=0.40")
+    opened(window, editor=next(i for i, choice in enumerate(EDITORS) if choice.kind == "grade"))
+    assert "old" in dict(window.main_view.work.transient.shelf.looks)
+    (folder / "old.cube").rename(folder / "new.cube")
+    for is_open in (False, True):
+        window.main_view.store.replace(replace(window.main_view.work, form_open=is_open))
+        turn(window)
+    names = dict(window.main_view.work.transient.shelf.looks)
+    assert ("old" in names, "new" in names) == (False, True)
