@@ -46,7 +46,7 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
             region it has loaded
 
     Raises:
-        ProgdfError: it cannot be read or written.
+        ProgdfError: it is empty, or it cannot be read or written.
     """
     if form.region in (ALL, CHANGED):
         return form.region
@@ -59,6 +59,8 @@ def region_option(form: NewEdit, folder: Path, state: SelectionState, total: int
         raise ProgdfError(f"the region {form.region} was deleted; choose another one")
     members = state.members if region is None else region.members
     check_members(members, total)
+    if not unpack(members, total).any():
+        raise ProgdfError("the region is empty; select something, or choose another region")
     make_folder(folder)
     path = folder / f"{name or f'{zlib.crc32(members):08x}'}{selection.SUFFIX}"
     write_region(NamedRegion(name, path, members, state.count), total)

@@ -18,6 +18,7 @@ from viewer.files import region_files, session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.commands import Plain, Rename, WithText
+from viewer.state.forms import SELECTION, NewEdit
 from viewer.state.selection import SelectionState
 
 TOTAL = 1500
@@ -206,3 +207,12 @@ def test_window_saves_a_region_beside_the_scene_and_in_the_session(tmp_path: Pat
         assert (tmp_path / "coat.region.npy").exists(), "a session that is saved has its regions"
         app.parts.file_actions.open(tmp_path / "work.session.json")
         assert app.main_view.work.view.selection == work.view.selection
+
+
+def test_empty_selection_is_no_region(tmp_path: Path) -> None:
+    one = selection.select(SelectionState(), np.arange(20) == 3)
+    for state in (SelectionState(), selection.select(one, np.zeros(20, bool))):
+        with pytest.raises(ProgdfError, match="the region is empty"):
+            region_files.region_option(NewEdit(region=SELECTION), tmp_path, state, 20)
+    assert not list(tmp_path.iterdir())
+    assert region_files.region_option(NewEdit(region=SELECTION), tmp_path, one, 20)
