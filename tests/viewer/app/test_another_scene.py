@@ -21,7 +21,15 @@ from viewer.render.paint_overlay import packed_picture
 from viewer.state import selection
 from viewer.state.selection import NamedRegion, SelectionState, pack
 from viewer.state.transient import PreviewState
-from viewer.state.view_state import Brush, ColorBrush, SelectTool, SnapshotPair, ViewState, on_another_scene
+from viewer.state.view_state import (
+    Brush,
+    ColorBrush,
+    SceneState,
+    SelectTool,
+    SnapshotPair,
+    ViewState,
+    on_another_scene,
+)
 from viewer.state.workspace import mark_saved, new_workspace
 
 OF_THE_WINDOW = {
@@ -58,6 +66,7 @@ def test_new_scene_keeps_only_the_window_settings() -> None:
     picture = packed_picture(view.camera, (2, 2), np.full((2, 2, 4), 255, np.uint8))
     view = replace(view, color_brush=ColorBrush("clone"), painted=(picture,))
     view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1", mode="rings")
+    view = replace(view, scenes=(SceneState(0, "bear"),))
     plain = ViewState()
     changed = {
         field.name for field in fields(ViewState) if getattr(view, field.name) != getattr(plain, field.name)
