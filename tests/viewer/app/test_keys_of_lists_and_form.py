@@ -95,12 +95,12 @@ def test_ctrl_enter_trains_after_a_click_on_the_picture(form: Rig) -> None:
     assert form.main_view.take_requests() == (Plain("train"),)
 
 
-def test_escape_closes_the_form_and_keeps_the_typed_name(form: Rig) -> None:
+def test_escape_closes_the_form_without_its_name(form: Rig) -> None:
     focus = form.main_view.work.focus
     type_text(form, "hat")
     strike(form, "Escape")
     work = form.main_view.work
-    assert (work.form_open, work.form.name, work.focus) == (False, "hat", focus)
+    assert (work.form_open, work.form.name, work.focus) == (False, "", focus)
     strike(form, "H")
     assert not form.main_view.work.view.layers[1].enabled, "shortcuts are back"
 
