@@ -56,7 +56,8 @@ def render(argv: Sequence[str]) -> int:
         raise ProgdfError("--alpha goes with a picture or a film; leave out comparisons and sheets")
     saved = None if opened.session is None else view.camera
     stored = opened.document.stored_camera
-    camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored)
+    framed = opened.document.framed_scene if opened.document.files else None
+    camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored, framed)
     if _is_single(options, view):
         check_camera_file(options.out)
     swept = _swept_layers(options, opened)

@@ -28,6 +28,7 @@ def choose_camera(
     saved: ViewCamera | None,
     up: Vec3 | None = None,
     stored: Camera | None = None,
+    framed: Gaussians | None = None,
 ) -> Camera:
     """Return the requested camera, the session's, the one stored in the scene's file, or a frame of the
     scene.
@@ -39,6 +40,7 @@ def choose_camera(
         saved: camera of a session
         up: unit vector that is up in the scene; None estimates it
         stored: camera stored in the scene's file
+        framed: Gaussians that a frame of the whole view shows; None: the scene
 
     Raises:
         ProgdfError: options that contradict each other or name nothing.
@@ -53,11 +55,12 @@ def choose_camera(
         return camera if size is None else fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height
-    view = saved or view_camera.first_camera(scene, aspect=aspect, up=up, stored=stored)
+    whole = scene if framed is None else framed
+    view = saved or view_camera.first_camera(whole, aspect=aspect, up=up, stored=stored)
     if viewpoint.orbit is not None:
         view = parse_orbit(viewpoint.orbit, view)
     if viewpoint.frame is not None or (viewpoint.orbit is not None and saved is None):
-        view = _frame_on(view, viewpoint.frame, scene, gdfs, aspect)
+        view = _frame_on(view, viewpoint.frame, whole if viewpoint.frame is None else scene, gdfs, aspect)
         if viewpoint.orbit is not None:  # an explicit distance overrides the fit
             view = parse_orbit(viewpoint.orbit, view)
     return view_camera.to_camera(view, width, height)

@@ -16,7 +16,7 @@ from PIL import Image
 from progdf.__main__ import main
 from progdf.camera import Camera
 from progdf.compose.reference import Layer, compose_layers
-from progdf.formats.ply import load_ply
+from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import camera_in_picture, load_cameras, read_camera, save_cameras
@@ -151,6 +151,21 @@ def test_frame_fits_a_region_or_the_whole_scene(run: Run) -> None:
         assert run("render", "bear.ply", "scarf.gdf", *options) == 0
     bare = {name: shown_share(f"{name}.png") for name in ("scarf", "plain", "all")}
     assert bare["scarf"] < bare["plain"] < bare["all"]
+
+
+def test_picture_frames_a_sparse_scene_beside_a_dense_one(run: Run, stack: Stack, tmp_path: Path) -> None:
+    sparse = tmp_path / "sparse.ply"
+    save_ply(sparse, stack.scene[::20])
+    picture = tmp_path / "both.png"
+    assert run("render", sparse, "bear.ply", "--place", "bear=12,0,0", *SMALL, "-o", picture) == 0
+    camera = read_camera(str(picture))
+    center = stack.scene.means.mean(dim=0)
+    for shift in (0.0, 12.0):
+        point = camera.viewmat[:3, :3] @ (center + torch.tensor([shift, 0.0, 0.0])) + camera.viewmat[:3, 3]
+        x, y, depth = (camera.K @ point).tolist()
+        assert depth > 0
+        assert 0 < x / depth < camera.width
+        assert 0 < y / depth < camera.height
 
 
 def shown_share(path: str) -> float:
