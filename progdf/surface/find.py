@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,7 +37,8 @@ from .models import (
 )
 
 OPAQUE = 0.97
-"""Minimum opacity of a pixel that has a surface."""
+"""Minimum opacity of a pixel whose depth is that of a surface."""
+_HALF = 0.5  # opacity; below it, a pixel shows more of the background than of the scene
 
 MEDIAN_PX = 9
 """Window of the median filter of depths, pixels."""
@@ -104,6 +106,25 @@ class PaintSurface:
         names = " and ".join(fit.model.name for fit in self.fits)
         scatter = max(fit.residual_px for fit in self.fits)
         return f"{names}; the scene's depth deviates by {scatter:.0f} px"
+
+
+def surface_pixels(alpha: NDArray[np.floating[Any]]) -> Mask:
+    """Return the pixels of a surface: the opaque ones, and the thin spots among them.
+
+    Scans are thinner in places. A group of connected pixels below `OPAQUE` is a thin spot if all of them are
+    opaque by half or more. Along outlines and around gaps the opacity falls to 0.
+
+    Args:
+        alpha: opacity, 0..1. [H,W]
+
+    Returns:
+        [H,W]
+    """
+    opaque = alpha > OPAQUE
+    groups, count = ndimage.label(~opaque)
+    lowest = np.ones(count + 1)
+    np.minimum.at(lowest, groups.ravel(), alpha.ravel())
+    return np.asarray(opaque | (lowest[groups] >= _HALF))
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: Mask) -> Array:
@@ -181,7 +202,7 @@ def find_surface(scene: Gaussians, camera: Camera, painted: Mask, seen: Depth | 
         seen: the depth of the camera's own view, if it is known
     """
     seen = render_depth(scene, camera) if seen is None else seen
-    opaque = (seen.alpha > OPAQUE).numpy()
+    opaque = surface_pixels(seen.alpha.numpy())
     local = local_surface(seen, camera)
     on_surface = painted & opaque
     if not on_surface.any():

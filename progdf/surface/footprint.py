@@ -14,7 +14,7 @@ import numpy as np
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
-from .find import OPAQUE, SAME_SURFACE_DEVIATIONS, light_moments
+from .find import SAME_SURFACE_DEVIATIONS, light_moments, surface_pixels
 from .models import (
     MIN_SAMPLES,
     Array,
@@ -64,7 +64,7 @@ def depth_picture(scene: Gaussians, camera: Camera) -> DepthPicture:
     """Return the depth picture of a scene."""
     mean, spread, alpha = light_moments(scene, camera)
     drawn = alpha > 0
-    return DepthPicture(camera, np.where(drawn, mean, 0.0), spread, alpha > OPAQUE)
+    return DepthPicture(camera, np.where(drawn, mean, 0.0), spread, surface_pixels(alpha))
 
 
 def fit_footprint(picture: DepthPicture, column: float, row: float, radius_px: float) -> Footprint | None:

@@ -85,6 +85,11 @@ class PastingEditor(ImageEditor, Protocol):
         ...
 
     @property
+    def left_out(self) -> int:
+        """Pixels of the given pictures that show no surface of the region and stay unpainted."""
+        ...
+
+    @property
     def finds_colors(self) -> bool:
         """True if colors of the scene's Gaussians replace discs where they are at least as good."""
         ...

@@ -18,7 +18,7 @@ from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
-from progdf.surface.find import OPAQUE, PaintSurface, find_surface
+from progdf.surface.find import PaintSurface, find_surface, surface_pixels
 from progdf.surface.footprint import depth_picture, near_surface
 from progdf.system.equality import equal_fields
 from trainer.options import EditKind, EditorOptions
@@ -133,6 +133,7 @@ class DecalEditor:
     view: View  # the camera's view
     drawn: Tensor  # the part of the decal on the surface: premultiplied colors and alpha. [H,W,4]
     surface: PaintSurface  # the surface under it
+    left_out: int  # see `PastingEditor`
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = False
@@ -155,7 +156,7 @@ class DecalEditor:
 def decal(given: EditorInput) -> DecalEditor:
     """Return the editor of `decal:LOGO.png` with `--at` and `--camera`.
 
-    The decal is visible only on pixels of the camera's view where the region is opaque and at most the
+    The decal is visible only on pixels of the camera's view that show a surface of the region, at most the
     decal's size away from the surface under its center.
 
     Raises:
@@ -179,11 +180,14 @@ def decal(given: EditorInput) -> DecalEditor:
     seen = render_depth(scene, camera)
     alpha = seen.alpha
     near = near_surface(depth_picture(scene, camera), place.x, place.y, place.size)
-    drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha) & torch.from_numpy(near))[..., None]
-    if not bool((drawn[..., 3] > MIN_ALPHA).any()):
+    has_surface = torch.from_numpy(surface_pixels(alpha.numpy()) & near)
+    wanted = drawn[..., 3] > MIN_ALPHA
+    drawn = drawn * (has_surface & (view.mask > 0.5 * alpha))[..., None]
+    painted = drawn[..., 3] > MIN_ALPHA
+    if not bool(painted.any()):
         raise ProgdfError(
             f"{given.what} does not lie on an opaque part of the region '{region.name}'; "
             "give another position with --at"
         )
-    surface = find_surface(scene, camera, (drawn[..., 3] > MIN_ALPHA).numpy(), seen)
-    return DecalEditor(scene, view, drawn, surface)
+    surface = find_surface(scene, camera, painted.numpy(), seen)
+    return DecalEditor(scene, view, drawn, surface, int((wanted & ~painted).sum()))

@@ -15,7 +15,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
-from progdf.surface.find import OPAQUE, PaintSurface, find_surface
+from progdf.surface.find import PaintSurface, find_surface, surface_pixels
 from progdf.system.equality import equal_fields
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import MIN_ALPHA, PaintedView, composite_over, cover_view, project_paint
@@ -45,6 +45,7 @@ class PaintEditor:
 
     scene: Gaussians
     layers: Sequence[PaintLayer]
+    left_out: int  # see `PastingEditor`
     seen: Gaussians | None = None  # see `EditorInput`
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
@@ -100,7 +101,7 @@ def check_paint(what: str, options: EditorOptions) -> None:
 def paint(given: EditorInput) -> PaintEditor:
     """Return the editor of `paint:A.png[,B.png…]`.
 
-    The paint is visible only on pixels where the region is opaque.
+    The paint is visible only on pixels that show a surface of the region.
 
     Raises:
         ProgdfError: a picture or its camera is invalid, or no paint lies on the region.
@@ -109,14 +110,16 @@ def paint(given: EditorInput) -> PaintEditor:
     paths = picture_paths(given.what)
     cameras = with_near_plane(picture_cameras(paths, (), scene.origin), scene)
     layers = list[PaintLayer]()
+    left_out = 0
     for path, camera in zip(paths, cameras, strict=True):
         rgba = _read_rgba(path)
         camera, rgba = _shrink(camera, rgba)
         view = make_view(scene, given.region, camera, torch.tensor(BACKGROUND))
         seen = render_depth(scene, camera)
-        on_region = (seen.alpha > OPAQUE) & (view.mask > 0.5 * seen.alpha)
-        drawn = rgba * on_region[..., None]
+        has_surface = torch.from_numpy(surface_pixels(seen.alpha.numpy()))
+        drawn = rgba * (has_surface & (view.mask > 0.5 * seen.alpha))[..., None]
         painted = drawn[..., 3] > MIN_ALPHA
+        left_out += int(((rgba[..., 3] > MIN_ALPHA) & ~painted).sum())
         if bool(painted.any()):
             surface = find_surface(scene, camera, painted.numpy(), seen)
             layers.append(PaintLayer(view, drawn, surface))
@@ -124,7 +127,7 @@ def paint(given: EditorInput) -> PaintEditor:
         raise ProgdfError(
             f"no paint lies on an opaque part of the region '{given.region.name}'; paint on the scene"
         )
-    return PaintEditor(scene, layers, given.seen)
+    return PaintEditor(scene, layers, left_out, given.seen)
 
 
 def _shrink(camera: Camera, rgba: Tensor) -> tuple[Camera, Tensor]:

@@ -96,6 +96,11 @@ def paste_decal(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, 
         f"{made}; {view_psnr} dB in its own view, {figures['ring']} dB in the {RING} pixels around it, "
         f"{side_psnrs['-30']} and {side_psnrs['+30']} dB from 30° to either side"
     )
+    if figures["left_out"]:
+        log.say(
+            f"{group_digits(figures['left_out'])} pixels of the picture show no surface of the region and "
+            "stay unpainted"
+        )
     log.say(result.line)
     return result
 
@@ -158,6 +163,7 @@ def train_decal(
     middle = TURNS.index(0)
     figures: dict[str, Any] = {
         "pixels": sum(int(paint.mask.sum()) for paint in paints),
+        "left_out": editor.left_out,
         "added": 0 if gdf.added is None else len(gdf.added),
         "moved": len(gdf.region),
         "own": errors[middle],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from progdf.surface.find import find_surface, fit_surface, light_thickness
+from progdf.surface.find import find_surface, fit_surface, light_thickness, surface_pixels
 from progdf.surface.models import Samples, fit_planes, fit_quadric, fit_spline
 from tests.trainer.painted_wall import CAMERA, SIDE, wall
 
@@ -135,3 +135,19 @@ def test_thickness_is_the_spread_of_the_light() -> None:
     pixel = 3.0 / float(CAMERA.K[0, 0])
     assert light_thickness(scene, CAMERA, all_pixels) == pytest.approx(pixel, rel=0.1)
     assert 0.03 < light_thickness(wall(rough=0.1), CAMERA, all_pixels) < 0.1
+
+
+def test_thin_spots_belong_to_the_surface_and_outlines_do_not() -> None:
+    alpha = np.full((20, 20), 1.0, np.float32)
+    alpha[:, 15:] = np.linspace(0.9, 0.1, 5)
+    alpha[4:6, 4:7] = 0.8
+    alpha[0, 2] = 0.6
+    alpha[10:13, 6:9] = 0.7
+    alpha[11, 7] = 0.2
+    found = surface_pixels(alpha)
+    expected = np.ones((20, 20), bool)
+    expected[:, 15:] = False
+    expected[10:13, 6:9] = False
+    assert (found == expected).all()
+    assert surface_pixels(np.full((3, 3), 0.8)).all(), "an evenly thin wall"
+    assert not surface_pixels(np.full((3, 3), 0.4)).any()

@@ -19,6 +19,7 @@ from progdf.io.cameras import save_cameras
 from progdf.metrics.image import psnr
 from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
+from progdf.rasterize.engines import render_depth
 from progdf.region import whole_scene
 from progdf.surface.find import orbit
 from tests.helpers.edits import bits
@@ -163,6 +164,30 @@ def test_transparent_pixels_leave_the_scene_unchanged(tmp_path: Path) -> None:
     logo[..., 3] = 0
     with pytest.raises(ProgdfError, match="is fully transparent"):
         make(put(tmp_path, logo), scene)
+
+
+def test_decal_covers_thin_spots_of_the_surface(tmp_path: Path) -> None:
+    solid = wall()
+    center = solid.means[:, :2].norm(dim=1) < 0.12
+    logits = torch.where(center, torch.tensor(-4.0), solid.logit_opacities)
+    scene = replace(solid, logit_opacities=logits)
+    alpha = render_depth(scene, CAMERA).alpha[44:84, 44:84]
+    assert 0.9 < float(alpha.min()) < 0.95
+    editor = make(put(tmp_path, np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)), scene)
+    assert editor.left_out == 0
+    edited = train_decal(editor, scene, "logo")
+    assert edited.figures["left_out"] == 0
+    shown = picture(edited_scene(scene, edited.gdf))[46:82, 46:82]
+    assert psnr(shown, editor.paints[0].picture[46:82, 46:82]) > 30.0
+
+
+def test_paint_off_the_surface_is_counted(tmp_path: Path) -> None:
+    scene = wall()
+    half = scene[(scene.means[:, 0] < 0.1).nonzero()[:, 0]]
+    editor = make(put(tmp_path, np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)), half)
+    painted = int(editor.paints[0].mask.sum())
+    assert 500 < editor.left_out < 1100
+    assert painted + editor.left_out == 1600
 
 
 def test_angle_turns_a_decal_counterclockwise(tmp_path: Path) -> None:
