@@ -84,6 +84,9 @@ def test_wheel_holds_exactly_the_files_of_the_packages(wheel: Path) -> None:
         Path(n).name for n in packed
     }
     assert "Name: progdf-studio\n" in text
+    targets = re.findall(r"\]\(([^)]+)\)|(?:src|href)=\"([^\"]+)", text.partition("\n\n")[2])
+    assert targets, "the description is the README"
+    assert [target for target in targets if not "".join(target).startswith("https://")] == []
     assert set(re.findall(r"^Provides-Extra: (.*)$", text, re.MULTILINE)) == set(
         PROJECT["optional-dependencies"]
     )
