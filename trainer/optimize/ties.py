@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.sparse import csr_matrix, diags
-from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from progdf.camera import Camera
@@ -19,9 +19,9 @@ from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.reach import drop_unsupported, find_fade, surface_reach
 from trainer.regions.surface import covered_rows, surface_likeness
 
+from .tie_solver import TieLevel, gather_levels, solve_ties
+
 _MIN_LIKENESS = 5e-3  # minimum share of a member's total likeness: most of its neighbors are hardly alike
-_MAX_CG_STEPS = 300  # maximum number of conjugate gradient steps; each propagates by one member
-_CG_TOLERANCE = 1e-6  # relative tolerance of the solution
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,11 @@ class Ties:
     def links(self) -> csr_matrix:
         """Ties between different members, ≥ 0. [M,M]"""
         return csr_matrix(diags(self.graph.diagonal()) - self.graph)
+
+    @cached_property
+    def levels(self) -> list[TieLevel]:
+        """The ties, and those between groups of members, for `spread`."""
+        return gather_levels(self.links)
 
     def limit(self, values: Tensor) -> Tensor:
         """Return values of the members scaled by `reach`. [M,…]"""
@@ -86,7 +91,7 @@ class Ties:
     def spread(self, residual: Tensor, weights: Tensor, ridge: float) -> Tensor:
         """Return the residual, spread from members with enough weight to those around them.
 
-        Descent over the views would take far too many steps to propagate around a body.
+        Descent over the views would take far too many steps to propagate around a body, see `solve_ties`.
 
         Args:
             residual: [M,b,3]
@@ -94,15 +99,9 @@ class Ties:
                 residual is ignored. [M]
             ridge: weight that pulls every residual to 0, in the same unit
         """
-        weight = weights.double().numpy()[:, None]
-        system = csr_matrix(self.graph + diags(weight[:, 0] + ridge))
         values = residual.flatten(1).double().numpy()
-        scale = diags(1.0 / system.diagonal())
-        columns = [
-            cg(system, weight[:, 0] * column, column, rtol=_CG_TOLERANCE, maxiter=_MAX_CG_STEPS, M=scale)[0]
-            for column in values.T
-        ]
-        return torch.from_numpy(np.stack(columns, axis=1)).to(residual).view_as(residual)
+        spread = solve_ties(self.levels, weights.double().numpy(), ridge, values)
+        return torch.from_numpy(spread).to(residual).view_as(residual)
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:

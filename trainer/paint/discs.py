@@ -371,7 +371,11 @@ def _main_pieces(
 ) -> NDArray[np.int64]:
     """Return the piece of the surface in which each row has most weight. -> [N]"""
     size = (count, int(piece.max()) + 1)
-    return cast(NDArray[np.int64], csr_array((weights, (owner, piece)), shape=size).argmax(axis=1))
+    sums = csr_array((weights, (owner, piece)), shape=size).tocoo()  # one entry per row and piece
+    by_weight = np.lexsort((-sums.col, sums.data))
+    main = np.zeros(count, np.int64)
+    main[sums.row[by_weight]] = sums.col[by_weight]  # the largest weight is written last
+    return main
 
 
 def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) -> Gaussians:
