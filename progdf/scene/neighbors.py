@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -218,17 +219,36 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
     Returns:
         Rows of the neighbors, nearest first, [Q,k] int64, and their distances [Q,k] float64.
     """
+    if not len(rows):
+        k = min(k, len(points) - 1)
+        return rows.new_zeros(0, k), torch.zeros(0, k, dtype=torch.float64)
+    ((_, neighbors, distances),) = iterate_nearest_rows(points, rows, k, len(rows), workers)
+    return neighbors, distances
+
+
+def iterate_nearest_rows(
+    points: Tensor, rows: Tensor, k: int, block: int, workers: int = 1
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield blocks of rows with the results of `nearest_rows`.
+
+    Args:
+        points, rows, k, workers: see `nearest_rows`
+        block: number of rows in a block; limits memory
+    """
     k = min(k, len(points) - 1)
     positions = points.double().numpy()
-    distances, neighbors = PointTree(positions, k + 1).query(positions[rows.numpy()], k + 1, workers=workers)
-    dropped = neighbors == rows.numpy()[:, None]
-    # where more than k points are equal, the point itself may be absent from the results
-    dropped[~dropped.any(axis=1), -1] = True
-    others = ~dropped
-    return (
-        torch.from_numpy(neighbors[others].reshape(len(rows), k)),
-        torch.from_numpy(distances[others].reshape(len(rows), k)),
-    )
+    tree = PointTree(positions, k + 1)
+    for searched in torch.split(rows, block):
+        distances, neighbors = tree.query(positions[searched.numpy()], k + 1, workers=workers)
+        dropped = neighbors == searched.numpy()[:, None]
+        # where more than k points are equal, the point itself may be absent from the results
+        dropped[~dropped.any(axis=1), -1] = True
+        others = ~dropped
+        yield (
+            searched,
+            torch.from_numpy(neighbors[others].reshape(len(searched), k)),
+            torch.from_numpy(distances[others].reshape(len(searched), k)),
+        )
 
 
 def typical_spacing(places: Tensor) -> float:

@@ -17,7 +17,7 @@ from progdf.system.equality import equal_fields
 from progdf.terminal import format_count
 from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.reach import drop_unsupported, find_fade, surface_reach
-from trainer.regions.surface import covered_rows, surface_likeness
+from trainer.regions.surface import covered_rows, surface_links
 
 from .tie_solver import TieLevel, gather_levels, solve_ties
 
@@ -120,9 +120,6 @@ def surface_graph(scene: Gaussians, covered: Tensor) -> csr_matrix:
     count = len(scene)
     if count < 3:
         return csr_matrix((count, count))
-    near, likeness = surface_likeness(scene, torch.arange(count), covered)
-    alike = (likeness >= _MIN_LIKENESS).numpy()
-    rows = np.repeat(np.arange(count), alike.sum(axis=1))
-    ties = csr_matrix((likeness.double().numpy()[alike], (rows, near.numpy()[alike])), (count, count))
+    ties = surface_links(scene, torch.arange(count), _MIN_LIKENESS, covered).astype(np.float64)
     ties = 0.5 * (ties + ties.T)
     return csr_matrix(diags(np.asarray(ties.sum(axis=1)).ravel()) - ties)
