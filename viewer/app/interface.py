@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from imgui_bundle import imgui, imgui_ctx
 
-from progdf.errors import ProgdfError
 from viewer.panel import dialogs, histogram, panel, timeline_bar, tools, view_settings
 from viewer.panel.card import BLEND_TITLES
 from viewer.pictures.compare import PHOTOGRAPH, Labels
@@ -310,9 +309,6 @@ def perform_actions(work: Workspace, actions: Sequence[Action], pointer: Pointer
     for action in actions:
         before = work
         name = action.name
-        if name == "select_subject":
-            work = _select_subject(work, pointer)
-            continue
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
         if name == "select_refine":
             work = _ask_if_doubled(before, work, pointer)
@@ -347,14 +343,6 @@ def _describe_blend(work: Workspace) -> str:
 
 MAX_REFINE_GROWTH = 2.0
 """Largest factor by which Refine enlarges a selection without asking."""
-
-
-def _select_subject(work: Workspace, pointer: PointerContext) -> Workspace:
-    """Select the object in the middle of the picture, or show the reason if there is none."""
-    try:
-        return select_tool.select_in_middle(work, pointer)
-    except ProgdfError as error:
-        return workspace.with_message(work, str(error), pointer.now, error=True)
 
 
 def _ask_if_doubled(before: Workspace, work: Workspace, pointer: PointerContext) -> Workspace:

@@ -271,7 +271,7 @@ class MainView:
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
         view = self._displayed_view()
-        area = self._pointer().size
+        area = self.pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         self.canvas.comparer.photograph = frusta.compared_view(self.work, self.work.view)[1]
         pointed = self.work.pointed if view.panel else None
@@ -287,7 +287,7 @@ class MainView:
             view, screen, area, held, self._clock, focus, pointed, live, pulled=pulled, guessed=guessed
         )
         if self.canvas.pixels == 1 and not self._is_held():
-            self._pointer().look_ahead()
+            self.pointer().look_ahead()
 
     @property
     def at_start(self) -> bool:
@@ -312,8 +312,8 @@ class MainView:
         asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
-            work, self._keys = handles.take_keys(self.work, self._pointer(), self._keys)
-            work, self._keys = pull_tool.take_keys(work, self._pointer(), self._keys)
+            work, self._keys = handles.take_keys(self.work, self.pointer(), self._keys)
+            work, self._keys = pull_tool.take_keys(work, self.pointer(), self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies
@@ -343,14 +343,14 @@ class MainView:
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
                 self.store.replace(
                     interface.panels(
-                        self.work, self._pointer(), pictures, reveal, compared, self.distributions
+                        self.work, self.pointer(), pictures, reveal, compared, self.distributions
                     )
                 )
             self._revealed = self.work.focus, several
         held = self.work.transient.tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
             work = self.work
-            pointer = self._pointer()
+            pointer = self.pointer()
             self.store.replace(with_transient(work, tool=MouseTool()))  # the drag ends if it raises
             with self._guard():
                 self.store.replace(mouse.handle_mouse(work, pointer))
@@ -366,7 +366,7 @@ class MainView:
         if isinstance(work.transient.gizmo, Decal | Pull) or not pull_tool.is_free(work):
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
             if not (asks or self.at_start or imgui.get_io().want_text_input):
-                held, self._keys = mouse.point_by_keys(held, self._keys, self._pointer(), clicks)
+                held, self._keys = mouse.point_by_keys(held, self._keys, self.pointer(), clicks)
                 self.store.replace(with_transient(work, pointer=held))
         elif held.at or held.down:
             mouse.let_go(held)
@@ -404,17 +404,17 @@ class MainView:
         asked = ""
         takes_mouse = False
         with self._guard():  # Escape also leaves handles that cannot be drawn
-            draw_ghosts(self.work.transient, self._pointer())
+            draw_ghosts(self.work.transient, self.pointer())
             if isinstance(gizmo, Gizmo):
-                moved, asked = handles.draw_gizmo(gizmo, self._pointer(), self.decal_surfaces)
+                moved, asked = handles.draw_gizmo(gizmo, self.pointer(), self.decal_surfaces)
                 takes_mouse = handles.gizmo_takes_mouse(gizmo, moved)
             elif isinstance(gizmo, Pull):
                 moved, asked, takes_mouse = pull_tool.update(
-                    gizmo, self.work, self._pointer(), self.decal_surfaces, pressed
+                    gizmo, self.work, self.pointer(), self.decal_surfaces, pressed
                 )
             elif gizmo is not None:
-                moved, asked = draw_decal(gizmo, self._pointer(), self.decal_surfaces, "Enter" in pressed)
-                takes_mouse = decal_takes_mouse(moved, self._pointer())
+                moved, asked = draw_decal(gizmo, self.pointer(), self.decal_surfaces, "Enter" in pressed)
+                takes_mouse = decal_takes_mouse(moved, self.pointer())
         if gizmo is None:
             return False
         self.store.replace(with_transient(self.work, gizmo=moved))
@@ -452,9 +452,9 @@ class MainView:
 
     def _perform(self, action: Action) -> None:
         with self._guard():
-            self.store.replace(interface.perform_actions(self.work, [action], self._pointer()))
+            self.store.replace(interface.perform_actions(self.work, [action], self.pointer()))
 
-    def _pointer(self) -> PointerContext:
+    def pointer(self) -> PointerContext:
         """Return the context of the pointer: scene, area and displayed view."""
         area = self._area()
         if self.work.transient.tool.drag is None:
@@ -510,7 +510,7 @@ class MainView:
 
     def _draw_overlays(self) -> None:
         """Draw the overlays of the picture; request another frame if one of them disappears."""
-        pointer = self._pointer()
+        pointer = self.pointer()
         before = self.work
         over = max(self._popups) > 1  # a list over the dialog takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
@@ -543,7 +543,7 @@ class MainView:
     @property
     def picture_size(self) -> tuple[int, int]:
         """Width and height of the picture on screen, in pixels."""
-        return self._pointer().size
+        return self.pointer().size
 
     def take_requests(self) -> tuple[Action, ...]:
         """Return the pending requests of the window and clear them."""
@@ -597,4 +597,4 @@ class MainView:
         layers = None
         with contextlib.suppress(ProgdfError):  # the picture has the names of the edits alone
             layers = self.layers_of(view)
-        return self.canvas.save(self.pictures, title, view, self._pointer().size, layers, self.remember)
+        return self.canvas.save(self.pictures, title, view, self.pointer().size, layers, self.remember)

@@ -16,7 +16,7 @@ from progdf import __version__
 from progdf.errors import ProgdfError, without_commands
 from progdf.io.atomic import state_folder
 from viewer.state.commands import Action
-from viewer.state.workspace import Dialog, Store, with_message, with_question
+from viewer.state.workspace import CANCEL, Dialog, Message, Store, on_one_line, with_message, with_question
 
 LOG = "window.log"
 
@@ -41,6 +41,16 @@ class Messages:
         self._store.replace(with_message(work, text, self._clock(), error, details, button=button))
         self._store.wake()
 
+    @property
+    def current(self) -> Message | None:
+        """The message on screen."""
+        return self._store.get().message
+
+    def clear(self) -> None:
+        """Remove the message on screen."""
+        self._store.replace(replace(self._store.get(), message=None))
+        self._store.wake()
+
     def offer(self, text: str, *buttons: tuple[str, Action], error: bool = False) -> None:
         """Show one line below the axes with buttons (label and command), until one of them is pressed."""
         self._store.replace(with_question(self._store.get(), text, buttons, error))
@@ -56,6 +66,34 @@ class Messages:
         work = self._store.get()
         self._store.replace(replace(work, requests=(*work.requests, request)))
         self._store.wake()
+
+
+class WorkSign:
+    """Message about work in progress. It stays until the work ends; other messages stay for their time.
+
+    Args:
+        messages: messages to the user
+    """
+
+    def __init__(self, messages: Messages) -> None:
+        self._messages = messages
+        self._shown = ""
+
+    def show(self, text: str, cancel: Action | None = None) -> None:
+        """Show the state of the work, with a button that cancels it if there is a command for that."""
+        text = on_one_line(text)
+        message = self._messages.current
+        is_own = message is None or not self._shown or message.text == self._shown
+        if is_own and (message is None or text != self._shown):
+            self._shown = text
+            self._messages.show(text, button=None if cancel is None else (CANCEL, cancel))
+
+    def end(self) -> None:
+        """Remove the message."""
+        message = self._messages.current
+        if message is not None and message.text == self._shown:
+            self._messages.clear()
+        self._shown = ""
 
 
 _Made = TypeVar("_Made")

@@ -32,6 +32,7 @@ from progdf.scene.selection import (
     project_centers,
 )
 from progdf.scene.subject import select_subject
+from viewer.camera.view_camera import Vec3
 from viewer.render.picking import seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.forms import with_color
@@ -242,17 +243,18 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Worksp
     return _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
 
 
-def select_in_middle(work: Workspace, pointer: PointerContext) -> Workspace:
-    """Replace the selection by the object in the middle of the picture, with its paint.
+def find_subject(surface: Surface, neighborhood: Callable[[], Neighborhood], up: Vec3) -> Mask:
+    """Return the object in the middle of a picture. [N]
+
+    Args:
+        surface: surface of the scene on screen, which must not change meanwhile
+        neighborhood: returns the neighborhood of its Gaussians, computed on first use
+        up: up axis of the view
 
     Raises:
         ProgdfError: see `select_subject`.
     """
-    up = torch.tensor(work.view.camera.up)
-    surface = pointer.surface
-    mask = select_subject(surface.scene, pointer.facts.neighborhood(), surface.camera, up)
-    mask = mask | pointer.facts.paint_on(work.view, mask)
-    return _with(work, selection.select(work.view.selection, mask))
+    return select_subject(surface.scene, neighborhood(), surface.camera, torch.tensor(up))
 
 
 def spread(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Workspace:

@@ -363,9 +363,12 @@ def _resize(workspace: Workspace, times: float) -> Workspace:
 
 
 def _close_or_unfocus(workspace: Workspace, _: None) -> Workspace:
-    """Close the first active one, in this order: key list, brush, tool, measure, form, layers, focus."""
+    """Close the first active one: key list, work in progress, brush, tool, measure, form, layers, focus."""
     if workspace.help:
         return replace(workspace, help=False)
+    cancel = None if workspace.message is None else workspace.message.cancel
+    if cancel is not None and workspace.transient.gizmo is None:
+        return replace(workspace, message=None, requests=(*workspace.requests, cancel))
     if workspace.view.brush.active:
         return _change_brush(workspace, active=False)
     if workspace.view.color_brush.tool:

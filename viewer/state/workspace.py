@@ -77,6 +77,10 @@ class SceneFacts:
         return paint
 
 
+CANCEL = "Cancel"
+"""Label of a message's button that cancels the work in progress. Escape presses it."""
+
+
 @dataclass(frozen=True)
 class Message:
     """One-line message to the user, visible until a time of the window's clock, in seconds."""
@@ -86,6 +90,11 @@ class Message:
     error: bool = False
     details: str = ""  # details of an internal error, to be copied into a report
     button: tuple[str, Action] | None = None  # label and command of its button
+
+    @property
+    def cancel(self) -> Action | None:
+        """Command that cancels the work that the message is about; None for other messages."""
+        return self.button[1] if self.button is not None and self.button[0] == CANCEL else None
 
 
 @dataclass(frozen=True)
@@ -296,7 +305,7 @@ def with_message(
         seconds = DETAILS_S
     elif error or button:
         seconds = ERROR_S
-    return replace(workspace, message=Message(_on_one_line(text), now + seconds, error, details, button))
+    return replace(workspace, message=Message(on_one_line(text), now + seconds, error, details, button))
 
 
 def with_question(
@@ -310,10 +319,11 @@ def with_question(
         buttons: label and command of each
         error: mark it as an error
     """
-    return replace(workspace, question=Question(_on_one_line(text), tuple(buttons), error))
+    return replace(workspace, question=Question(on_one_line(text), tuple(buttons), error))
 
 
-def _on_one_line(text: str) -> str:
+def on_one_line(text: str) -> str:
+    """Return a text on one line, with escaped control characters."""
     return escape_text(" ".join(text.split()))
 
 

@@ -96,6 +96,10 @@ class PointerContext:
         """Surface of the picture for tools; valid until another strength is drawn."""
         return self.surfaces.at(self._surface_key) or Surface(self.scene, self.camera(self.shown.camera))
 
+    def still_surface(self) -> Surface:
+        """Return the surface of the picture for another thread: later strengths do not change it."""
+        return self.surfaces.at(self._surface_key) or self._copy_surface()
+
     def visible_dots(self, strokes: tuple[Rows, Rows]) -> tuple[Floats, Floats]:
         """Return the visible dots of both kinds of strokes, pixels of the picture. [M,2], [K,2]"""
         thinned = [rows[:: len(rows) // _MAX_DOTS + 1] for rows in strokes]

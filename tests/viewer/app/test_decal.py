@@ -75,7 +75,7 @@ def rig_with(logo: Path) -> Iterator[Rig]:
 def at_once(hand: Rig) -> None:
     """Draw a frame with the depth of the view, which the window computes in another thread."""
     view = hand.main_view
-    pointer = view._pointer()
+    pointer = view.pointer()
     view.decal_surfaces.depth(view.engine.scene, pointer.camera(pointer.shown.camera), at_once=True)
     hand.event()
 
@@ -131,13 +131,13 @@ def test_handles_remain_after_the_click_and_change_the_decal(logo: Path) -> None
         assert moved.frame is not None
         assert moved.frame.center != first.frame.center
         assert moved.frame.size == pytest.approx(first.frame.size)
-        corners, center, knob = outline(moved.frame, moved, hand.main_view._pointer())
+        corners, center, knob = outline(moved.frame, moved, hand.main_view.pointer())
         out = corners[1] + 0.5 * (corners[1] - center)
         hand.drag(tuple(corners[1]), tuple(out))
         scaled = shown(hand)
         assert scaled.frame is not None
         assert scaled.frame.size == pytest.approx(1.5 * first.frame.size, rel=0.05)
-        corners, center, knob = outline(scaled.frame, scaled, hand.main_view._pointer())
+        corners, center, knob = outline(scaled.frame, scaled, hand.main_view.pointer())
         aside = center + np.array([-80.0, -80.0])
         hand.modifier(imgui.Key.mod_ctrl, True)
         hand.drag(tuple(knob), tuple(aside))

@@ -43,7 +43,7 @@ def _shown(hand: Rig, folder: Path) -> tuple[Viewpoint, ...]:
 def test_click_on_a_frustum_looks_through_its_camera(tmp_path: Path) -> None:
     with rig() as hand:
         found = _shown(hand, tmp_path)
-        camera = hand.main_view._pointer().camera(hand.main_view.work.view.camera)
+        camera = hand.main_view.pointer().camera(hand.main_view.work.view.camera)
         viewmat = camera.viewmat.double().numpy()
         middles = [np.mean(viewpoint.corners, axis=0) for viewpoint in found]
         inside = [viewmat[:3, :3] @ middle + viewmat[:3, 3] for middle in middles]
@@ -81,7 +81,7 @@ def test_photograph_is_compared_until_the_view_moves(tmp_path: Path) -> None:
         view = hand.main_view
         found = viewpoints(cameras, tmp_path, view.work.view.camera, view.facts.bounds)
         view.store.replace(with_transient(view.work, viewpoints=found))
-        view.store.replace(look_through(view.work, found[0], view._pointer()))
+        view.store.replace(look_through(view.work, found[0], view.pointer()))
         view.wake()
         hand.settle()
         assert (view.work.view.compare.mode, view.work.view.compare.against) == ("split", "photograph")

@@ -56,7 +56,7 @@ def test_two_clicks_measure_the_distance_of_surface_points() -> None:
         assert measure.distance == pytest.approx(float(np.linalg.norm(np.subtract(*measure.points))))
         assert measure.distance > 0.0
         pixels = [
-            typed._project(np.array(p), hand.main_view._pointer().camera(camera)) for p in measure.points
+            typed._project(np.array(p), hand.main_view.pointer().camera(camera)) for p in measure.points
         ]
         np.testing.assert_allclose(pixels, [FIRST, SECOND], atol=0.6)
         assert hand.main_view.work.view.camera == camera
@@ -124,6 +124,6 @@ def test_session_keeps_the_unit(folder: Path) -> None:
 def test_typed_offset_is_in_the_unit_of_the_scene() -> None:
     gizmo = Gizmo("transform", (0.0, 0.0, 0.0), np.eye(4))
     with rig(first_view(bear()), WINDOW) as hand:
-        camera = hand.main_view._pointer().camera(hand.main_view.work.view.camera)
+        camera = hand.main_view.pointer().camera(hand.main_view.work.view.camera)
     sight = typed.Sight(camera, (0.0, 0.0), (0.0, 0.0), unit=2.0)
     assert typed.value_of(gizmo, TypedTransform("move", np.eye(4), "X", "3"), sight) == [1.5, 0.0, 0.0]

@@ -413,7 +413,7 @@ def test_model_of_the_surface_replaces_the_depth_of_a_view(hand: Rig) -> None:
     hand.drag(START, END)
     (picture,) = painted(hand)
     view = hand.main_view
-    pointer = view._pointer()
+    pointer = view.pointer()
     fits = view.paint.fits
     fits.drop()
     seen = pointer.view_surface(picture.camera, picture.size)

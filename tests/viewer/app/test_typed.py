@@ -227,7 +227,7 @@ def test_rotation_and_scale_keep_the_pivot(text: str) -> None:
     gizmo = typed.with_pivot(handles_of(similar(2)), "base")
     keys = Keys(tuple(Press(chord) for chord in text.split()))
     with rig(first_view(bear())) as hand:
-        pointer = hand.main_view._pointer()
+        pointer = hand.main_view.pointer()
         moved, unused = typed.take_keys(gizmo, keys, pointer)
         assert not unused.pressed
         after = typed.follow(moved, pointer, hand.main_view.decal_surfaces)
@@ -257,7 +257,7 @@ def test_fields_set_position_rotation_and_scale(pivot: Pivot) -> None:
 
 def test_ctrl_steps_the_mouse_by_15_degrees_and_tenths() -> None:
     with rig(first_view(bear())) as hand:
-        camera = hand.main_view._pointer().camera(hand.main_view.work.view.camera)
+        camera = hand.main_view.pointer().camera(hand.main_view.work.view.camera)
     gizmo = replace(handles_of(np.eye(4)), center=bear_center())
     for does, step in (("rotate", 15.0), ("scale", 0.1)):
         transform = typed.TypedTransform(does, np.eye(4))  # type: ignore[arg-type]
@@ -277,7 +277,7 @@ def bear_center() -> tuple[float, float, float]:
 @pytest.mark.parametrize("axes", ["", "X", "Y", "YZ", "XZ"])
 def test_mouse_moves_the_part_with_the_pointer_along_the_axes(axes: str) -> None:
     with rig(first_view(bear())) as hand:
-        camera = hand.main_view._pointer().camera(hand.main_view.work.view.camera)
+        camera = hand.main_view.pointer().camera(hand.main_view.work.view.camera)
     gizmo = replace(handles_of(np.eye(4)), center=bear_center())
     start = typed._project(np.array(gizmo.center), camera)
     before = (float(start[0]), float(start[1]))

@@ -20,7 +20,7 @@ from .painting import PaintingActions
 from .pictures import PictureActions
 from .preview import PreviewActions
 from .pulling import PullActions
-from .scene_checks import StrayActions, UpActions
+from .scene_checks import SearchActions, UpActions
 from .scene_list import SceneListActions
 from .start import StartActions
 from .tidy import TidyActions
@@ -39,7 +39,7 @@ class WindowParts:
     start: StartActions
     scene_list: SceneListActions
     up: UpActions
-    strays: StrayActions
+    searches: SearchActions
     maker: LayerMaker
     tidy: TidyActions
     painting: PaintingActions
@@ -56,7 +56,7 @@ class WindowParts:
             self.start,
             self.preview,
             self.scene_list,
-            self.strays,
+            self.searches,
             self.maker,
             self.tidy,
             self.painting,
@@ -67,7 +67,15 @@ class WindowParts:
     @property
     def polls(self) -> tuple[Callable[[], float | None], ...]:
         """Functions that poll a part and return the seconds until the next poll, None for never."""
-        parts = (self.jobs, self.painting, self.pictures, self.preview, self.start, self.strays, self.pulling)
+        parts = (
+            self.jobs,
+            self.painting,
+            self.pictures,
+            self.preview,
+            self.start,
+            self.searches,
+            self.pulling,
+        )
         return (
             self.scene_list.poll,
             self.maker.poll,
@@ -79,7 +87,7 @@ class WindowParts:
     @property
     def closers(self) -> tuple[Callable[[], None], ...]:
         """Functions that free the resources of a part, in the order of their calls."""
-        parts = (self.start, self.preview, self.strays, self.jobs, self.maker, self.pulling)
+        parts = (self.start, self.preview, self.searches, self.jobs, self.maker, self.pulling)
         return (*(part.close for part in parts), self.file_actions.release)
 
     def leave_scene(self) -> None:
@@ -177,7 +185,13 @@ def make_parts(
         start=start,
         scene_list=scene_list,
         up=UpActions(store=store, documents=documents, messages=messages),
-        strays=StrayActions(store=store, documents=documents, messages=messages),
+        searches=SearchActions(
+            store=store,
+            documents=documents,
+            messages=messages,
+            pointer=main_view.pointer,
+            wake=wake_window,
+        ),
         maker=maker,
         tidy=tidy,
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),

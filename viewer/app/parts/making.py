@@ -14,11 +14,11 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.threads import StoppedError, stopped_by
-from viewer.app.messages import Messages, Requests
+from viewer.app.messages import Messages, Requests, WorkSign
 from viewer.app.parts.edits import EditActions
 from viewer.files.document import DocumentStore
 from viewer.jobs.training import edits_folder, free_path
-from viewer.state.commands import Action, Plain
+from viewer.state.commands import Plain
 from viewer.state.transient import Pull
 from viewer.state.workspace import Store
 
@@ -47,7 +47,6 @@ class _Making:
     stop: threading.Event = field(default_factory=threading.Event)
     share: float | None = None  # finished share; None: not known
     future: Future[None] = field(default_factory=Future)
-    reported: str = ""  # the last message about it
 
     def advance(self, share: float) -> None:
         """Report progress, see `Progress`."""
@@ -86,6 +85,7 @@ class LayerMaker:
         self.patience_s = patience_s
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="layer")
         self._making: _Making | None = None
+        self._sign = WorkSign(messages)
 
     @property
     def requests(self) -> Requests:
@@ -154,25 +154,19 @@ class LayerMaker:
             return None
         if making.future.done():
             self._making = None
+            self._sign.end()
             self._finish(making)
             return None
         self._report(making)
         return _POLL_S
 
     def _report(self, making: _Making) -> None:
-        """Show the progress if it has changed; other messages stay for their time."""
-        text = f"Making {making.name} …"
-        button: tuple[str, Action] | None = ("Cancel", Plain("stop_making"))
-        if making.share is not None:
-            text = f"{text} {100.0 * making.share:.0f} %"
+        """Show the progress."""
         if making.stop.is_set():
-            text = f"Canceling {making.name} …"
-            button = None
-        message = self._store.get().message
-        is_own = message is None or message.text == making.reported or not making.reported
-        if is_own and (message is None or text != making.reported):
-            making.reported = text
-            self._messages.show(text, button=button)
+            self._sign.show(f"Canceling {making.name} …")
+            return
+        share = "" if making.share is None else f" {100.0 * making.share:.0f} %"
+        self._sign.show(f"Making {making.name} …{share}", Plain("stop_making"))
 
     def wait(self) -> None:
         """Wait for the layer in the making, and add it."""
@@ -184,6 +178,7 @@ class LayerMaker:
         """Cancel the layer in the making, as another scene opens."""
         if self._making is not None:
             self._making.stop.set()
+            self._sign.end()
         self._making = None
 
     def close(self) -> None:
