@@ -6,6 +6,7 @@ Each editor has one factory and one row in `EDITORS`, which answers every questi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from trainer.options import REMOVAL_VIEWS, EditorOptions
 from trainer.views.view import RegionThumbnail, View
 
 from .adapters import default_model
-from .base import EditorInput, EditorRow, ImageEditor
+from .base import EditorInput, EditorRow, ImageEditor, Waiting
 from .command import check_command_editor, command
 from .decal import check_decal, decal
 from .instruct import IMAGE_SIZE, check_instruct, instruct
@@ -246,7 +247,7 @@ def check_server(options: EditorOptions) -> None:
 def make_editor(
     options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
     glances: Callable[[], Sequence[RegionThumbnail]] = list, seen: Gaussians | None = None,
-    say: Callable[[str], object] = str,
+    say: Callable[[str], object] = str, waiting: Waiting = nullcontext,
 ) -> ImageEditor:  # fmt: skip
     """Return the editor that the options name (see `EditorInput`).
 
@@ -254,4 +255,4 @@ def make_editor(
         ProgdfError: the editor cannot be made.
     """
     row = editor_row(options)
-    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen, say))
+    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen, say, waiting))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -14,6 +15,9 @@ from progdf.region import Region
 from trainer.options import EditKind, EditorOptions, Kind
 from trainer.paint.discs import PaintedView
 from trainer.views.view import RegionThumbnail, View
+
+Waiting = Callable[[str], AbstractContextManager[object]]
+"""Function that reports a wait, described by a line, while its context is open."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,7 @@ class EditorInput:
     glances: Callable[[], Sequence[RegionThumbnail]] = list
     seen: Gaussians | None = None  # the scene that edited pictures show; None: `scene`
     say: Callable[[str], object] = str  # receives lines for the run's log; the default drops them
+    waiting: Waiting = nullcontext  # reports waits for a server; the default drops them
 
 
 class ImageEditor(Protocol):

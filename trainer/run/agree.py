@@ -570,7 +570,9 @@ def make_run_editor(
     """
     settings = replace(options.editor, cache=folder.paintings)
     glances = partial(render_thumbnails, options.views, setup.scene, setup.region)
-    editor = make_editor(settings, setup.scene, setup.region, setup.views, glances, setup.seen, log.say)
+    editor = make_editor(
+        settings, setup.scene, setup.region, setup.views, glances, setup.seen, log.say, log.waiting
+    )
     if not isinstance(editor, FramePainter):
         return editor, {}
     painter = editor

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
@@ -82,7 +83,9 @@ class RunLog:
         self._earlier = 0.0
         self._progress = progress
         self._written = 0.0
-        self._share = 0.0
+        self._state: dict[str, Any] = {"share": 0.0, "label": "", "count": "", "loss": "", "seconds": 0.0}
+        self._waits = 0  # waits in progress, in all threads
+        self._lock = threading.Lock()  # any thread may report a wait
         self._work: Mapping[str, float] = {"views": 1.0, "edit": 1.0, "optimize": 5.0, **LATER}
         self._ended_seconds: dict[str, float] = {}  # seconds of finished stages
         self._begun_at: dict[str, float] = {}
@@ -181,6 +184,8 @@ class RunLog:
         """
         release_memory()
         begun = last = time.perf_counter()
+        label = "Waiting for picture" if what == "edit" else STAGES[what]
+        self._write_state(label=label, count=f"1 of {total}" if what == "edit" else "", loss="")
 
         def report_step(done: int, word: str) -> float:
             share = min(done / max(total, 1), 1.0)
@@ -233,6 +238,27 @@ class RunLog:
 
             yield count_part
 
+    @contextmanager
+    def waiting(self, text: str) -> Iterator[None]:
+        """Report a wait by a line, and as the current step until it ends.
+
+        Of several waits at the same time only the first is reported.
+        """
+        with self._lock:
+            self._waits += 1
+            is_reported = self._waits == 1
+            step = {name: self._state[name] for name in ("label", "count")}
+            if is_reported:
+                self.say(text)
+                self._write_state(label=text, count="")
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._waits -= 1
+                if is_reported and self._state["label"] == text:  # else another step was reported meanwhile
+                    self._write_state(**step)
+
     def close(self) -> None:
         """Close the file."""
         with suppress(OSError):  # a full disk, already reported
@@ -245,17 +271,17 @@ class RunLog:
             return
         self._written = now
         total = self._total()
-        self._share = max(self._share, total / max(total + left, 1e-9))
-        state = {
-            "share": self._share,
-            "label": STAGES[what],
-            "count": count,
-            # a field's loss is on another scale
-            "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
-            "seconds": total,
-        }
-        with suppress(OSError, ProgdfError):
-            write_file(self._progress, json.dumps(state, ensure_ascii=False))
+        # a field's loss is on another scale
+        loss = word.removeprefix("loss to the edit ") if what == "optimize" else ""
+        share = max(self._state["share"], total / max(total + left, 1e-9))
+        self._write_state(share=share, label=STAGES[what], count=count, loss=loss)
+
+    def _write_state(self, **changes: Any) -> None:
+        """Rewrite the progress file with changed values; ignore a failed write."""
+        self._state |= {**changes, "seconds": self._total()}
+        if self._progress is not None:
+            with suppress(OSError, ProgdfError):
+                write_file(self._progress, json.dumps(self._state, ensure_ascii=False))
 
     def _total(self) -> float:
         return self._earlier + time.perf_counter() - self._start

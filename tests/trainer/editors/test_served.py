@@ -9,8 +9,11 @@ import re
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import pytest
 import torch
@@ -22,7 +25,7 @@ from tests.helpers.trained import LABELS, quick_options, small, train, write_bea
 from trainer import cli
 from trainer.editors import make_editor
 from trainer.editors.painter import PaintRequest, RefusedError
-from trainer.editors.server.calls import Address, BusyError
+from trainer.editors.server.calls import Address, BusyError, Waits, persist
 from trainer.editors.server.editor import ServedEditor, check_served, explain_sending
 from trainer.editors.server.images_api import ImagesApi, check_api
 from trainer.options import EditorOptions, with_values
@@ -100,6 +103,43 @@ def test_server_that_asks_to_wait_is_asked_again() -> None:
     with image_server(model) as server:
         paint_first(settings_of(server.url))
         assert len(server.calls) == 2
+
+
+class _NoWait(Event):
+    """Event whose waits end at once."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self.is_set()
+
+
+@pytest.mark.parametrize(
+    ("wait_s", "lines"),
+    [
+        (20.0, ["The server asks to wait 20 s"]),
+        (0.5, []),  # too short to be noticed
+        (None, ["The server is busy. Next call in 1 s"]),
+    ],
+)
+def test_wait_for_a_busy_server_is_reported(
+    wait_s: float | None, lines: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trainer.editors.server.calls._FIRST_WAIT_S", 1.0)
+    reported = list[str]()
+
+    @contextmanager
+    def report(line: str) -> Iterator[None]:
+        reported.append(line)
+        yield
+
+    failures = [BusyError(ProgdfError("busy"), wait_s)]
+
+    def call() -> str:
+        if failures:
+            raise failures.pop()
+        return "picture"
+
+    assert persist(call, Waits(_NoWait(), report)) == "picture"
+    assert reported == lines
 
 
 HALF = base64.b64encode(png(Image.new("RGB", (64, 64), "red")))[:-3].decode()

@@ -173,6 +173,8 @@ def test_interruption_ends_waits_for_a_busy_server(tmp_path: Path) -> None:
         server.before = busy
         process = start(tmp_path / "run", server.options)
         assert begun.wait(120)
+        assert process.stdout is not None
+        assert any("The server asks to wait 2 min" in line for line in process.stdout)
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=30)
         assert process.returncode == 130

@@ -85,3 +85,31 @@ def test_remaining_time_is_within_a_factor_of_two(
             now = begun + takes[stage]
     log.close()
     assert worst < 2.0
+
+
+def test_stage_that_edits_views_names_the_awaited_picture(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", quiet=True, progress=tmp_path / "progress.json")
+    with log.steps("edit", 12):
+        state = json.loads((tmp_path / "progress.json").read_text("utf-8"))
+    log.close()
+    assert (state["label"], state["count"]) == ("Waiting for picture", "1 of 12")
+
+
+def test_wait_is_the_current_step_until_it_ends(tmp_path: Path) -> None:
+    def step() -> str:
+        state = json.loads((tmp_path / "progress.json").read_text("utf-8"))
+        return f"{state['label']} {state['count']}".strip()
+
+    log = RunLog(tmp_path / "log.txt", quiet=True, progress=tmp_path / "progress.json")
+    with log.steps("edit", 12) as advance:
+        with log.waiting("The server asks to wait 20 s"):
+            assert step() == "The server asks to wait 20 s"
+            with log.waiting("The server asks to wait 30 s"):  # of another call at the same time
+                assert step() == "The server asks to wait 20 s"
+        assert step() == "Waiting for picture 1 of 12"
+        with log.waiting("The server asks to wait 5 s"):
+            log._written = -1.0
+            advance(1, "")  # the picture of another call arrives
+        assert step() == "Editing views 1 of 12"
+    log.close()
+    assert (tmp_path / "log.txt").read_text("utf-8").count("asks to wait") == 2

@@ -13,6 +13,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
@@ -25,7 +26,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO
 from progdf.io.images import read_picture, to_picture
 from progdf.io.picture_camera import find_picture_camera
-from progdf.terminal import escape_text, shorten
+from progdf.terminal import escape_text, format_duration, shorten
+from trainer.editors.base import Waiting
 from trainer.options import EditorOptions
 
 KEY = "OPENAI_API_KEY"
@@ -40,6 +42,7 @@ BUSY_STATUSES = (408, 409, 425, 429, 500, 502, 503, 504)
 _FIRST_WAIT_S = 0.5  # wait before the first retry if the server names none; doubled for each further one
 _MAX_BACKOFF_S = 8.0
 _MAX_WAIT_S = 120.0  # longest wait that a server may ask for
+_MIN_REPORTED_WAIT_S = 1.0  # shorter waits are not noticed
 _MAX_ANSWER_BYTES = 1 << 26  # largest answer of a server
 _Result = TypeVar("_Result")
 
@@ -58,18 +61,40 @@ class BusyError(Exception):
         self.wait_s = wait_s
 
 
-def persist(call: Callable[[], _Result], stop: Event) -> _Result:
+@dataclass(frozen=True)
+class Waits:
+    """Waits between the calls of a server."""
+
+    stop: Event  # ends them; set if the run is stopped
+    report: Waiting = nullcontext  # reports a wait
+
+    def wait(self, seconds: float, is_named: bool) -> None:
+        """Wait until the seconds are over or the run is stopped.
+
+        Args:
+            seconds: duration
+            is_named: the server asks for this duration
+        """
+        if seconds < _MIN_REPORTED_WAIT_S:
+            self.stop.wait(seconds)
+            return
+        text = "The server asks to wait" if is_named else "The server is busy. Next call in"
+        with self.report(f"{text} {format_duration(seconds)}"):
+            self.stop.wait(seconds)
+
+
+def persist(call: Callable[[], _Result], waits: Waits) -> _Result:
     """Return the result of a call that is made again after a `BusyError`.
 
     Args:
         call: makes the call once
-        stop: ends the waits between two calls
+        waits: waits between two calls
 
     Raises:
         ProgdfError: the last call failed, or the run is stopped.
     """
     for number in range(RETRIES + 1):
-        if stop.is_set():
+        if waits.stop.is_set():
             break
         try:
             return call()
@@ -77,7 +102,8 @@ def persist(call: Callable[[], _Result], stop: Event) -> _Result:
             if number == RETRIES:
                 raise busy.error from busy
             backoff = min(_FIRST_WAIT_S * 2**number, _MAX_BACKOFF_S)
-            stop.wait(backoff if busy.wait_s is None else min(busy.wait_s, _MAX_WAIT_S))
+            is_named = busy.wait_s is not None
+            waits.wait(backoff if busy.wait_s is None else min(busy.wait_s, _MAX_WAIT_S), is_named)
     raise ProgdfError("the calls of the server are stopped")
 
 

@@ -25,7 +25,7 @@ from trainer.editors.cache import Recipe
 from trainer.editors.painter import PaintRequest, RefusedError
 from trainer.options import EditorOptions
 
-from .calls import Address, Answer, BusyError, check_anchor, mask_png, one_line, persist, png
+from .calls import Address, Answer, BusyError, Waits, check_anchor, mask_png, one_line, persist, png
 from .workflow import Workflow, read_workflow
 
 _FIRST_POLL_S = 0.1  # wait before the second look for a result; grows to the longest one
@@ -88,7 +88,7 @@ class ComfyServer:
                 f"{self.workflow.path}"
             )
 
-    def edit(self, request: PaintRequest, prompt: str, stop: Event) -> Tensor:
+    def edit(self, request: PaintRequest, prompt: str, waits: Waits) -> Tensor:
         """See `ImageModel.edit`."""
         height, width = request.picture.shape[:2]
         files = {"input": png(request.picture)}
@@ -97,7 +97,7 @@ class ComfyServer:
         if request.mask is not None:
             files["mask"] = mask_png(request.mask)
         values: dict[str, object] = {
-            role: persist(partial(self._upload, content), stop)
+            role: persist(partial(self._upload, content), waits)
             for role, content in files.items()
             if role in self.workflow.nodes
         }
@@ -105,7 +105,7 @@ class ComfyServer:
         values["strength"] = request.strength
         values["seed"] = request.seed or 0
         graph = self.workflow.fill(values, self._optional)
-        content = persist(partial(self._run, graph, stop), stop)
+        content = persist(partial(self._run, graph, waits.stop), waits)
         return self.address.read_picture(content, (width, height))
 
     def _upload(self, content: bytes) -> str:
@@ -156,7 +156,7 @@ class ComfyServer:
                 f"returned no picture of the node titled output in {self.workflow.path}; use a SaveImage node"
             )
         query = urlencode({key: str(pictures[0].get(key, "")) for key in ("filename", "subfolder", "type")})
-        picture = persist(lambda: self.address.request(f"/view?{query}", _REQUEST_TIMEOUT_S), Event())
+        picture = persist(lambda: self.address.request(f"/view?{query}", _REQUEST_TIMEOUT_S), Waits(Event()))
         if picture.status != 200:
             raise self.address.fault(f"refuses its own picture with status {picture.status}; look at its log")
         return picture.content
@@ -201,7 +201,7 @@ class ComfyServer:
 
     def _json(self, path: str) -> dict[str, Any]:
         """Return the JSON object at a path, asking again while the server is busy."""
-        return persist(lambda: self._decode(self.address.request(path, _REQUEST_TIMEOUT_S)), Event())
+        return persist(lambda: self._decode(self.address.request(path, _REQUEST_TIMEOUT_S)), Waits(Event()))
 
     def _decode(self, answer: Answer) -> dict[str, Any]:
         """Return the JSON object of an answer."""

@@ -23,7 +23,7 @@ from trainer.editors.painter import FramePainter, PaintRequest
 from trainer.options import VIEWS, EditKind, EditorOptions
 from trainer.views.view import View
 
-from .calls import Address
+from .calls import Address, Waits
 from .comfy import check_comfy
 from .images_api import check_api
 
@@ -72,13 +72,13 @@ class ImageModel(Protocol):
         """
         ...
 
-    def edit(self, request: PaintRequest, prompt: str, stop: Event) -> Tensor:
+    def edit(self, request: PaintRequest, prompt: str, waits: Waits) -> Tensor:
         """Return the edited picture, at its size. -> [H,W,3] 0..1
 
         Args:
             request: the picture and its references
             prompt: the instruction; "": the model's own
-            stop: ends waits; set if the run is stopped
+            waits: waits between two calls
 
         Raises:
             RefusedError: a content filter refuses the picture.
@@ -99,7 +99,7 @@ class ServedEditor(FramePainter):
     stages: tuple[float, ...] = (1.0,)
     kind: EditKind = "style"
     is_confined: bool = False
-    _stop: Event = field(default_factory=Event, repr=False)
+    waits: Waits = field(default_factory=lambda: Waits(Event()), repr=False)
     _renders: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     has_start = False
@@ -169,7 +169,7 @@ class ServedEditor(FramePainter):
         if request.references and prompt:
             last = _LAST if len(request.references) > 1 else ""
             prompt = _FOLLOW.format(prompt=prompt, last=last)
-        return self.model.edit(request, prompt, self._stop)
+        return self.model.edit(request, prompt, self.waits)
 
     @property
     def keeps_running(self) -> bool:
@@ -178,7 +178,7 @@ class ServedEditor(FramePainter):
 
     def stop(self) -> None:
         """See `StoppableEditor.stop`."""
-        self._stop.set()
+        self.waits.stop.set()
 
 
 def api(given: EditorInput) -> ServedEditor:
@@ -196,7 +196,8 @@ def comfy(given: EditorInput) -> ServedEditor:
 def _make_editor(given: EditorInput, model: ImageModel, prompt: str) -> ServedEditor:
     options = given.options
     stages = () if model.has_strength else (1.0,)
-    return ServedEditor(given.scene, prompt, model, options, PictureCache(options.cache), stages)
+    waits = Waits(Event(), given.waiting)
+    return ServedEditor(given.scene, prompt, model, options, PictureCache(options.cache), stages, waits=waits)
 
 
 def split_degrees(text: str) -> tuple[str, ...]:

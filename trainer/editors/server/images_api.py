@@ -21,7 +21,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
-from threading import Event
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -40,6 +39,7 @@ from .calls import (
     KEY,
     Address,
     BusyError,
+    Waits,
     check_anchor,
     mask_png,
     one_line,
@@ -166,9 +166,9 @@ class ImagesApi:
         with suppress(BusyError):  # calls wait for a busy server
             self.address.request("", _CONNECT_TIMEOUT_S)
 
-    def edit(self, request: PaintRequest, prompt: str, stop: Event) -> Tensor:
+    def edit(self, request: PaintRequest, prompt: str, waits: Waits) -> Tensor:
         """See `ImageModel.edit`."""
-        return persist(partial(self._edit_once, request, prompt), stop)
+        return persist(partial(self._edit_once, request, prompt), waits)
 
     def _edit_once(self, request: PaintRequest, prompt: str) -> Tensor:
         """Make one call, and another one if the server refuses the size and names those that it accepts.
