@@ -16,7 +16,7 @@ If the ground around a hole has visible texture, the texture continues (`trainer
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -111,8 +111,16 @@ class Fill:
     notes: tuple[str, ...] = ()  # lines for the log
 
 
+def _ignore() -> None:
+    """Do nothing at a step of the progress."""
+
+
 def find_holes(
-    scene: Gaussians, rest: Gaussians, views: Sequence[View], depths: Sequence[Tensor] | None = None
+    scene: Gaussians,
+    rest: Gaussians,
+    views: Sequence[View],
+    depths: Sequence[Tensor] | None = None,
+    looked: Callable[[], object] = _ignore,
 ) -> OpenHoles:
     """Find the holes that a removal opens.
 
@@ -122,13 +130,20 @@ def find_holes(
         views: views of the original with the removed region's mask; only areas hidden in all of them are
             holes
         depths: `visible_depth` of the scene in each view; None computes it. [H,W] each
+        looked: called after each view, in any thread, for a progress bar
     """
     if not len(rest):
         return OpenHoles(rest, (), (), ())
     if depths is None:
         depths = map_threads(lambda view: visible_depth(scene, view.camera), views)
     seen = [(view.camera, depth, view.mask > 0.5) for view, depth in zip(views, depths, strict=True)]
-    return OpenHoles(rest, views, seen, map_threads(lambda view: find_hole(rest, view, seen), views))
+
+    def look(view: View) -> Hole:
+        hole = find_hole(rest, view, seen)
+        looked()
+        return hole
+
+    return OpenHoles(rest, views, seen, map_threads(look, views))
 
 
 def fill_holes(
@@ -136,6 +151,7 @@ def fill_holes(
     pictures: Mapping[str, Tensor] | None = None,
     close: bool = True,
     is_textured: bool = False,
+    looked: Callable[[], object] = _ignore,
 ) -> Fill:
     """Close the holes of a removal.
 
@@ -145,6 +161,7 @@ def fill_holes(
             the boundary. [H,W,3]
         close: False only counts the holes
         is_textured: continue the texture of the ground if it is visible
+        looked: called after each further look at a view, in any thread, for a progress bar
     """
     picture_colors = pictures or {}
     views = opened.views
@@ -162,7 +179,7 @@ def fill_holes(
         open_views.discard(best)
         for rows in _discs_for(opened, filled, holes[best], picture, is_textured, notes):
             trial = concatenate([filled, rows])
-            closed = _holes_with(trial, opened, holes)
+            closed = _holes_with(trial, opened, holes, looked)
             gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
             # discs off the surface open as many pixels in other views as they close
             if 2 * gain > holes[best].pixels:
@@ -175,19 +192,24 @@ def fill_holes(
     return Fill(concatenate(discs) if discs else None, len(discs), before, after, tuple(notes))
 
 
-def _holes_with(trial: Gaussians, opened: OpenHoles, holes: Sequence[Hole]) -> list[Hole]:
+def _holes_with(
+    trial: Gaussians, opened: OpenHoles, holes: Sequence[Hole], looked: Callable[[], object]
+) -> list[Hole]:
     """Return the holes that remain with added discs; views without a hole have none.
 
     Args:
         trial: the remaining scene with the discs
         opened: the holes before
         holes: the holes of the last accepted discs
+        looked: called after each look at a view
     """
 
     def look(index: int) -> Hole:
         if not holes[index].pixels:
             return holes[index]
-        return find_hole(trial, opened.views[index], opened.seen)
+        hole = find_hole(trial, opened.views[index], opened.seen)
+        looked()
+        return hole
 
     return map_threads(look, range(len(holes)))
 

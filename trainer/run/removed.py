@@ -41,6 +41,7 @@ from .finish import DEFAULTS, FULL_REPORT, ReportRequest, RunResult, differences
 
 _TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
 _MIN_PAINT = 2 / 255  # smallest color change that counts as paint
+_LOOKS_PER_VIEW = 9  # estimated renders of each view while a hole is filled, for the progress
 _JUDGED_STRENGTHS = (0.25, 0.5, 0.75, 0.9)  # strengths at which the visible change is measured
 
 
@@ -124,21 +125,19 @@ def remove_region(
     scene = setup.scene
     named = setup.region
     log.expect({"fill": 2.0, "measure the edit": 1.0})
-    with log.stage("fill"), log.steps("fill", 4) as advance:
-        advance(0, "")
+    with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
         kind = options.editor.fill or ("picture" if pictures else "surface")
         views = [*painted, *(view for view in around.train if view.camera.name not in pictures)]
         fill_pictures = pictures if kind == "picture" else None
-        depths = map_threads(lambda view: visible_depth(scene, view.camera), views)
-        close = partial(fill_holes, pictures=fill_pictures, close=kind != "none")
-        attempt = partial(_attempt, scene, views=views, depths=depths, close=close)
-        removal = _remove_whole(scene, named, around.train, attempt, log)
-        advance(2, "")
-        if kind == "surface" and removal.fill.rows is not None:
-            removal = replace(removal, fill=close(removal.opened, is_textured=True))
-        advance(3, "")
+        with log.looks("fill", _LOOKS_PER_VIEW * len(views)) as looked:
+            depths = _render_each(lambda view: visible_depth(scene, view.camera), views, looked)
+            close = partial(fill_holes, pictures=fill_pictures, close=kind != "none", looked=looked)
+            attempt = partial(_attempt, scene, views=views, depths=depths, close=close, looked=looked)
+            removal = _remove_whole(scene, named, around.train, attempt, log)
+            if kind == "surface" and removal.fill.rows is not None:
+                removal = replace(removal, fill=close(removal.opened, is_textured=True))
         fill = removal.fill
         for note in fill.notes:
             log.say(note)
@@ -257,12 +256,26 @@ class Removal:
         return rest if self.fill.rows is None else concatenate([rest, self.fill.rows])
 
 
+def _render_each(
+    render: Callable[[View], Tensor], views: Sequence[View], looked: Callable[[], None]
+) -> list[Tensor]:
+    """Return a picture of each view; call `looked` after each."""
+
+    def draw(view: View) -> Tensor:
+        picture = render(view)
+        looked()
+        return picture
+
+    return map_threads(draw, views)
+
+
 def _attempt(
     scene: Gaussians,
     region: Region,
     views: Sequence[View],
     depths: Sequence[Tensor],
     close: Callable[[OpenHoles], Fill],
+    looked: Callable[[], None],
 ) -> Removal:
     """Remove a region and fill the holes.
 
@@ -272,10 +285,11 @@ def _attempt(
         views: views with any mask
         depths: see `find_holes`
         close: fills the holes
+        looked: called after each render of a view
     """
-    masks = map_threads(lambda view: region_weight(scene, region, view.camera), views)
+    masks = _render_each(lambda view: region_weight(scene, region, view.camera), views, looked)
     masked = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
-    opened = find_holes(scene, scene[~region.mask], masked, depths)
+    opened = find_holes(scene, scene[~region.mask], masked, depths, looked)
     return Removal(region, opened, close(opened))
 
 

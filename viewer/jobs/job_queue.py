@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from progdf.errors import ProgdfError, without_commands
-from viewer.state.workspace import JobStatus
+from viewer.state.forms import CHANGED
+from viewer.state.workspace import JobCard, JobStatus
 
 from .child import GRACE_S, PICTURES_GRACE_S, Child, Progress, last_line
 from .consent import check_allowed
@@ -38,7 +39,7 @@ _COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULT
 class Delivery:
     """Command that writes a file or a folder. It leaves no files if it is stopped."""
 
-    name: str  # title of its card
+    title: str  # of its card
     out: Path
     words: tuple[str, ...]  # command-line arguments after `progdf`
     log: Path  # file for its output
@@ -111,6 +112,39 @@ class QueuedTask:
         if self.status != "running" or done < 0.05 or self.seconds < 2.0:
             return None
         return self.seconds * (1.0 - self.progress.share) / done
+
+
+def job_card(job: QueuedTask) -> JobCard:
+    """Return a job as the panel shows it."""
+    task = job.task
+    training = ""
+    starting = "Starting"
+    keepable = False
+    delivered = False
+    label = " ".join(filter(None, (job.progress.label, job.progress.count)))
+    if isinstance(task, EditOrder):
+        delivered = task.is_delivered
+        training = f"{task.editor} on {task.region}"
+        keepable = job.status == "stopped" and task.is_keepable
+        if task.region == CHANGED:
+            starting = "Finding the changes"
+    return JobCard(
+        job.number,
+        task.title,
+        task.out,
+        job.status,
+        training,
+        label or starting,
+        job.progress.share,
+        job.progress.loss,
+        seconds_left=job.seconds_left,
+        error=job.error,
+        warning=job.warning,
+        keepable=keepable,
+        delivered=delivered,
+        sends_pictures=task.sends_pictures,
+        offer=job.offer,
+    )
 
 
 class JobQueue:
@@ -186,7 +220,7 @@ class JobQueue:
             if job.status == "stopped" and not resumes:
                 self._unlock(job)
                 self.dismiss(number)
-                raise ProgdfError(f"{job.task.name} no longer exists; it was discarded or has finished")
+                raise ProgdfError(f"{job.task.title} no longer exists; it was discarded or has finished")
             self._change(replace(job, status="queued", resumes=resumes, error="", seconds=0.0))
 
     def stop(self, number: int) -> None:

@@ -88,6 +88,7 @@ class EditOrder:
     camera: str = ""  # file of that camera
     carry_on: str = ""  # value of `progdf train --carry-on`, "" for its default
     replaces: str = ""  # file of the edit whose layer the result replaces, "" for a new layer
+    hole_of: str = ""  # name of the removal whose hole it fills, "" for other runs
 
     def arguments(self, resumes: bool = False) -> list[str]:
         """Return the command-line arguments after `progdf`."""
@@ -103,6 +104,11 @@ class EditOrder:
         if resumes:
             words.append("--resume")
         return words
+
+    @property
+    def title(self) -> str:
+        """Title of its card."""
+        return f"Fill the hole of “{self.hole_of}”" if self.hole_of else self.name
 
     @property
     def fills(self) -> bool:
@@ -148,6 +154,18 @@ class EditOrder:
     def is_begun(self) -> bool:
         """True if the run has saved a state that it can resume from."""
         return os.path.isfile(self.out / "state" / "run.json")  # False if it may not be read
+
+    @property
+    def is_keepable(self) -> bool:
+        """True if it has a recording that is not a layer yet, and may become one.
+
+        A draft stays anyway. A run that replaces the layer of another one leaves that layer.
+        """
+        recording = self.newest_recording()
+        has_layer = self.draft.exists() or self.is_delivered or bool(self.replaces)
+        if recording is None or has_layer or self.paints_over_layers:
+            return False
+        return not _is_newer(self.kept_edit, recording)
 
     @property
     def paints_over_layers(self) -> bool:
@@ -290,6 +308,14 @@ class EditOrder:
 
     def _beside(self, suffix: str) -> Path:
         return self.out.with_name(self.out.name + suffix)
+
+
+def _is_newer(file: Path, other: Path) -> bool:
+    """Return whether both files exist and the first is newer."""
+    try:
+        return file.stat().st_mtime_ns > other.stat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def edits_folder(scene: Path) -> Path:

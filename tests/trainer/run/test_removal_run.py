@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,6 +41,7 @@ from trainer.options import (
 )
 from trainer.run.resume import picture_digests
 from trainer.run.run import train
+from trainer.store.progress import RunLog
 from trainer.views.setup import TrainingSetup, make_training_setup
 from trainer.views.view import View, on_backgrounds, render_view
 
@@ -129,6 +131,15 @@ def test_unseen_hole_is_closed_like_the_surface_around_it() -> None:
         assert decibels(float((pictures[1] - pictures[0])[~hole].square().mean())) > 40.0
 
 
+def test_progress_of_a_fill_counts_every_look_at_a_view() -> None:
+    scene, rest, setup = case()
+    looks = list[int]()
+    opened = find_holes(scene, rest, setup.train, looked=lambda: looks.append(1))
+    assert len(looks) == len(setup.train)
+    fill = fill_holes(opened, looked=lambda: looks.append(2))
+    assert fill.views <= looks.count(2) <= fill.views * len(setup.train)
+
+
 @pytest.mark.parametrize(("depth", "behind_region", "is_hole"), [("inf", False, False), ("1", True, True)])
 def test_hole_excludes_pixels_that_another_view_saw_through(
     depth: str, behind_region: bool, is_hole: bool
@@ -204,9 +215,22 @@ def members_of(scene: Gaussians) -> Region:
     return from_mask("post", torch.arange(len(scene)) >= len(case()[1]))
 
 
-def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path) -> None:
+def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "gone"
+    steps = list[tuple[str, float]]()
+    write = RunLog._write_state
+
+    def record(log: RunLog, **changes: Any) -> None:
+        write(log, **changes)
+        steps.append((log._state["label"], log._state["share"]))
+
+    monkeypatch.setattr(RunLog, "_write_state", record)
+    monkeypatch.setattr("trainer.store.progress._FILE_INTERVAL_S", 0.0)
     result = train(options_of(scene_file, out), quiet=True)
+    shares = [share for label, share in steps if label == "Filling the hole"]
+    assert len(set(shares)) > 36, "three looks at each of 12 views"
+    assert shares == sorted(shares)
+    assert max(shares) < 1.0
     scene = load_ply(scene_file)
     gdf = load_gdf(result.gdf, scene)
     report = json.loads((out / "report.json").read_text())

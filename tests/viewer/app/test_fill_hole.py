@@ -70,6 +70,7 @@ def test_hole_is_filled_by_a_run_and_the_removal_stays_until_then(window: applic
     region = next(word for word in Trainer.said if word.startswith("--region=file:"))
     assert np.load(region.removeprefix("--region=file:")).tolist() == ROWS
     (job,) = window.main_view.work.jobs
+    assert job.name == "Fill the hole of “removed”"
     assert (job.status, job.fills) == ("running", window.main_view.work.view.layers[0].gdf)
     assert shown(window).added is None, "the unfilled removal is shown until the fill is there"
     Trainer.ended = 0

@@ -12,10 +12,9 @@ import pytest
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
 from viewer.app.parts.start import EXAMPLE_TITLES
-from viewer.app.parts.training import job_card
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
-from viewer.jobs.job_queue import Delivery, QueuedTask
+from viewer.jobs.job_queue import Delivery, QueuedTask, job_card
 from viewer.jobs.training import EditOrder
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context

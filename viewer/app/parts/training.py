@@ -26,10 +26,10 @@ from viewer.files import exports, region_files, user_files
 from viewer.files.document import DocumentStore
 from viewer.files.scenes import OwnScene
 from viewer.jobs import consent, training
-from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
+from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask, job_card
 from viewer.jobs.training import EditOrder
 from viewer.state.commands import OnItem, Plain
-from viewer.state.forms import ALL, CHANGED, SELECTION, NewEdit, without_values
+from viewer.state.forms import ALL, SELECTION, NewEdit, without_values
 from viewer.state.selection import (
     SUFFIX,
     NamedRegion,
@@ -41,65 +41,12 @@ from viewer.state.selection import (
 )
 from viewer.state.transient import DecalGhost
 from viewer.state.view_state import LayerState
-from viewer.state.workspace import Dialog, JobCard, Store, with_transient
+from viewer.state.workspace import Dialog, Store, with_transient
 
 LIVE_EVERY_S = 3.0
 """Minimum interval between the recordings shown during a run, in seconds."""
 LIVE_SHARE = 0.05
 """Maximum share of the window's time spent on showing recordings."""
-
-
-def is_newer(file: Path, other: Path) -> bool:
-    """Return whether both files exist and the first is newer."""
-    try:
-        return file.stat().st_mtime_ns > other.stat().st_mtime_ns
-    except OSError:
-        return False
-
-
-def is_keepable(order: EditOrder) -> bool:
-    """Return whether a run has a recording that is not a layer yet, and may become one.
-
-    A draft stays anyway. A run that replaces the layer of another one leaves that layer.
-    """
-    recording = order.newest_recording()
-    has_layer = order.draft.exists() or order.is_delivered or bool(order.replaces)
-    if recording is None or has_layer or order.paints_over_layers:
-        return False
-    return not is_newer(order.kept_edit, recording)
-
-
-def job_card(job: QueuedTask) -> JobCard:
-    """Return a job as the panel shows it."""
-    task = job.task
-    training = ""
-    starting = "Starting"
-    keepable = False
-    delivered = False
-    label = " ".join(filter(None, (job.progress.label, job.progress.count)))
-    if isinstance(task, EditOrder):
-        delivered = task.is_delivered
-        training = f"{task.editor} on {task.region}"
-        keepable = job.status == "stopped" and is_keepable(task)
-        if task.region == CHANGED:
-            starting = "Finding the changes"
-    return JobCard(
-        job.number,
-        task.name,
-        task.out,
-        job.status,
-        training,
-        label or starting,
-        job.progress.share,
-        job.progress.loss,
-        seconds_left=job.seconds_left,
-        error=job.error,
-        warning=job.warning,
-        keepable=keepable,
-        delivered=delivered,
-        sends_pictures=task.sends_pictures,
-        offer=job.offer,
-    )
 
 
 class JobActions:
@@ -211,7 +158,7 @@ class JobActions:
         job = None if self._quits else next(iter(trainings + busy), None)
         if job is not None:
             kind = "training" if isinstance(job.task, EditOrder) else "delivery"
-            self._messages.ask(Dialog(kind, job.task.name))
+            self._messages.ask(Dialog(kind, job.task.title))
         return job is not None
 
     def _only_reports(self, job: QueuedTask) -> bool:
@@ -248,7 +195,8 @@ class JobActions:
             ProgdfError: a file is missing or cannot be written.
         """
         document = self._documents.get()
-        gdf_index = self._store.get().view.layers[self._edits.layer(index)].gdf
+        layer = self._store.get().view.layers[self._edits.layer(index)]
+        gdf_index = layer.gdf
         path = document.gdf_paths[gdf_index] if gdf_index < len(document.gdf_paths) else None
         if path is None:
             raise ProgdfError("this removal has no file; remove the selection again")
@@ -284,6 +232,7 @@ class JobActions:
             quick=False,
             threads=training.spare_threads(),
             replaces=str(path),
+            hole_of=layer.name,
         )
         self.queue.add(order)
 
@@ -450,7 +399,7 @@ class JobActions:
             return
         recording = order.newest_recording()
         edit = None
-        if recording is not None and is_keepable(order):
+        if recording is not None and order.is_keepable:
             edit = order.recorded_edit(recording, self._documents.get().file_at(order.scene).gaussians)
         if edit is None:
             raise ProgdfError(f"{order.name} has no recording that is not a layer yet; resume it")
@@ -470,7 +419,7 @@ class JobActions:
             self.queue.dismiss(job.number)
         # with the panel, its card shows the error
         if job.status == "failed" and not self._store.get().view.panel:
-            self._messages.show(f"{task.name}: {job.error}", error=True)
+            self._messages.show(f"{task.title}: {job.error}", error=True)
         if isinstance(task, Delivery):
             if job.status == "done" and task.words[0] == "rebind":
                 self.queue.dismiss(job.number)
@@ -496,9 +445,11 @@ class JobActions:
             if not self._take_result(task):
                 self._open_file(task.result)
             summary = "" if task.warning() else task.summary()  # its card shows the warning
-            self._messages.show(f"{task.name} is ready. {summary}" if summary else f"{task.name} is ready")
+            self._messages.show(
+                f"“{task.name}” is ready. {summary}" if summary else f"“{task.name}” is ready"
+            )
         else:
-            self._messages.show(f"{task.name} is ready: {task.result}")
+            self._messages.show(f"“{task.name}” is ready: {task.result}")
 
     def _take_fill(self, task: EditOrder) -> None:
         """Replace a removal by the filled one, if it is still a layer.
@@ -511,9 +462,9 @@ class JobActions:
             filled = load_gdf(task.result, document.file_at(task.scene).gaussians)
             save_gdf(task.result, leave_paint(filled))
         if task.scene in self._scenes and self._edits.replace_file(Path(task.replaces), task.result):
-            self._messages.show("The hole is filled")
+            self._messages.show(f"The hole of “{task.hole_of}” is filled")
         else:
-            self._messages.show(f"{task.name} is ready: {task.result}")
+            self._messages.show(f"The hole of “{task.hole_of}” is filled: {task.result}")
 
     def _take_result(self, task: EditOrder) -> bool:
         """Replace the layer of a draft, or of the run that is continued; return True if there is one."""
