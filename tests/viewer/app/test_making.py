@@ -101,17 +101,18 @@ def test_window_goes_on_while_a_layer_is_made(app: App, gate: Gate) -> None:
     keep_moved(app)
     gate.reached.wait()
     app.parts.maker.poll()
-    assert text(app) == "Making moved … 50 %"
+    assert text(app) == "Making “moved” … 50 %"
     assert names(app) == before
     assert app.main_view.work.transient.gizmo is None
     assert [layer.name for layer in app.main_view.work.transient.live] == ["moved"], "it is still drawn"
     press(app, "Alt+M")
     app.parts.maker.poll()
-    assert text(app).startswith("moved is still being made"), "one at a time"
+    assert text(app).startswith("“moved” is still being made"), "one at a time"
     gate.opened.set()
     app.parts.maker.wait()
     app.draw()
     assert names(app) == [*before, "moved"]
+    assert text(app) == "“moved” is ready"
     assert not app.main_view.work.transient.live
     members = bear().demo.members("scarf")
     moved = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]
@@ -133,7 +134,7 @@ def test_pull_is_prepared_while_a_layer_is_made(app: App, gate: Gate, canceled: 
     pose = pull_of(app).pose
     assert pose.handles
     press(app, "Enter")
-    assert text(app).startswith("moved is still being made"), "one at a time"
+    assert text(app).startswith("“moved” is still being made"), "one at a time"
     assert pull_of(app).pose == pose, "the handles stay"
     if canceled:
         app.main_view.messages.request(Plain("stop_making"))
@@ -160,7 +161,7 @@ def test_canceled_layer_returns_to_the_handles(app: App, gate: Gate) -> None:
     gate.opened.set()
     app.parts.maker.wait()
     app.draw()
-    assert text(app) == "moved was canceled"
+    assert text(app) == "“moved” was canceled"
     assert names(app) == before
     gizmo = app.main_view.work.transient.gizmo
     assert isinstance(gizmo, Gizmo)

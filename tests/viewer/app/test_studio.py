@@ -183,7 +183,7 @@ def test_edit_becomes_the_layer_before_its_report_ends(window: application.App) 
     assert window.documents.get().gdf_paths == (order.result,)
     assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
     assert order.draft.read_bytes() == before, "a film of it and a saved session name it"
-    assert window.main_view.work.message.text == f"{order.name} is ready"
+    assert window.main_view.work.message.text == f"“{order.name}” is ready"
     (card,) = window.main_view.work.jobs
     assert (card.status, card.delivered) == ("running", True)
     assert not window.parts.jobs.holds_window(), "a report does not hold the window"
@@ -282,7 +282,7 @@ def test_reproduced_share_of_paint_is_in_the_message_or_on_a_card(
     message = window.main_view.work.message
     assert message is not None
     ending = "" if card else ". 98 % of the paint was reproduced"
-    assert message.text == f"{job.task.name} is ready{ending}"
+    assert message.text == f"“{job.task.name}” is ready{ending}"
     assert not message.error
     assert [shown.warning for shown in window.main_view.work.jobs] == [warning] * card
 

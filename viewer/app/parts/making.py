@@ -105,7 +105,7 @@ class LayerMaker:
         """
         if self._making is not None:
             raise ProgdfError(
-                f"{self._making.name} is still being made; wait until it is ready, or cancel it"
+                f"“{self._making.name}” is still being made; wait until it is ready, or cancel it"
             )
 
     def begin(
@@ -163,10 +163,10 @@ class LayerMaker:
     def _report(self, making: _Making) -> None:
         """Show the progress."""
         if making.stop.is_set():
-            self._sign.show(f"Canceling {making.name} …")
+            self._sign.show(f"Canceling “{making.name}” …")
             return
         share = "" if making.share is None else f" {100.0 * making.share:.0f} %"
-        self._sign.show(f"Making {making.name} …{share}", Plain("stop_making"))
+        self._sign.show(f"Making “{making.name}” …{share}", Plain("stop_making"))
 
     def wait(self) -> None:
         """Wait for the layer in the making, and add it."""
@@ -197,10 +197,10 @@ class LayerMaker:
             making.done(False)
             if is_canceled:
                 making.path.unlink(missing_ok=True)
-                self._messages.show(f"{making.name} was canceled")
+                self._messages.show(f"“{making.name}” was canceled")
                 return
             making.future.result()  # raises its error
         making.done(True)
         pulls = isinstance(self._store.get().transient.gizmo, Pull)  # the selection limits what it moves
         self._edits.add(making.path, making.name, deselect=not pulls)
-        self._messages.show(f"{making.name} is ready; drag its slider")
+        self._messages.show(f"“{making.name}” is ready")

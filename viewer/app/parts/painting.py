@@ -84,7 +84,7 @@ class PaintingActions:
         self._pending.append((self._documents.get().path, paint))
         self._store.replace(with_transient(work, pending=(*work.transient.pending, paint)))
         self._store.change(view)
-        self._messages.show(f"Making {out.name}; the paint stays on screen until its layer is ready")
+        self._messages.show(f"Making “{out.name}”; the paint stays on screen until its layer is ready")
 
     def _write(
         self, painted: Sequence[PaintedPicture], layers: PictureLayers | None, out: Path, own: OwnScene
