@@ -11,7 +11,7 @@ import numpy as np
 from imgui_bundle import imgui
 
 from progdf.color.grade import grade_fully, parse_grade
-from progdf.color.looks import BUILT_IN, look_name
+from progdf.color.looks import BUILT_IN, describe_look, look_name
 from progdf.errors import ProgdfError
 from progdf.field.baked import lattice_colors
 from progdf.formats.cube import SIDE, SUFFIX, write_cube
@@ -59,7 +59,7 @@ class GradePreview:
         self._sheet: moderngl.Texture | None = None
         self._looks: tuple[tuple[str, str], ...] | None = None  # None: to be read again
         self._drawn: tuple[RegionSample, tuple[tuple[str, str], ...]] | None = None  # inputs of the sheet
-        self._scope_of: tuple[object, LiveGrade | None] | None = None
+        self._scope_of: tuple[object, bool, LiveGrade | None] | None = None
 
     @property
     def requests(self) -> Requests:
@@ -145,9 +145,11 @@ class GradePreview:
     def _update_scope(self, live: LiveGrade | None) -> None:
         """Compute the histogram again after a change."""
         sample = self._grader.sample
-        if self._scope_of is not None and self._scope_of[0] is sample and self._scope_of[1] == live:
+        is_empty = self._grader.is_empty
+        known = self._scope_of
+        if known is not None and known[0] is sample and known[1:] == (is_empty, live):
             return
-        self._scope_of = sample, live
+        self._scope_of = sample, is_empty, live
         work = self._store.get()
         self._store.replace(with_transient(work, scope=self._grader.scope(live)))
         self._store.wake()
@@ -199,12 +201,12 @@ class GradePreview:
         grade = parse_grade(settings)
         folder = user_files.looks_folder()
         make_folder(folder)
-        names = numbered_names(form.name.strip() or "Look")
+        names = numbered_names(form.name.strip() or describe_look(grade))
         path = next(path for name in names if not (path := folder / f"{name}{SUFFIX}").exists())
         write_cube(path, grade_fully(lattice_colors(SIDE).float(), grade), path.stem, settings)
         self._looks = None
         note = "; other programs read it without clarity" if grade.clarity else ""
-        line = f"Saved the look {look_name(path.stem)} as {path}{note}"
+        line = f"Saved the look “{look_name(path.stem)}” as {path}{note}"
         self._messages.show(line, button=("Show folder", Plain("show_looks")))
         self._store.wake()
 

@@ -115,7 +115,10 @@ def _content(work: Workspace, count: int, ui: UiContext, actions: list[Action]) 
     form = _region(form, selection, count, column, ui)
     form, action = _editor(form, action, column, ui)
     if form.choice.setting == "grade":
-        form = grade_form.draw(form, work.transient.scope, work.transient.shelf, column, ui, actions)
+        scope = work.transient.scope
+        if preview.failed:
+            scope = scope._replace(note=scope.note or "The colors cannot be measured")
+        form = grade_form.draw(form, scope, work.transient.shelf, column, ui, actions)
     else:
         form = _settings(form, preview, column, ui)
     if form.choice.has_anchor:

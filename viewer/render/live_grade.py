@@ -231,6 +231,11 @@ class FormGrader:
         self._last: tuple[object, LiveGrade | None] | None = None
         self._measured: tuple[object, ColorGrade] | None = None
 
+    @property
+    def is_empty(self) -> bool:
+        """True if the form's region has no Gaussians."""
+        return self.rows is not None and not len(self.rows)
+
     def live(self, form: NewEdit) -> LiveGrade | None:
         """Return the form's grade; None if it changes nothing."""
         if self.rows is None:
@@ -249,6 +254,8 @@ class FormGrader:
     def scope(self, live: LiveGrade | None) -> GradeScope:
         """Return the histogram of the region's colors under a grade; empty before they are known."""
         sample = self.sample
+        if self.is_empty:
+            return GradeScope(note="The region is empty: select something")
         if sample is None or not len(sample.colors):
             return GradeScope()
         stride = -(-len(sample.colors) // _SCOPE_COLORS)

@@ -55,6 +55,7 @@ class GradeScope(NamedTuple):
     bins: tuple[tuple[float, ...], ...] = ()  # luma, red, green and blue, dark to bright, 0 to 1
     white: float = 0.0  # share of the region that is clipped to white, 0 to 1
     black: float = 0.0  # share that is clipped to black
+    note: str = ""  # reason why there are no bins, "" while they are measured
 
 
 class LookShelf(NamedTuple):
@@ -165,6 +166,7 @@ class Decal:
     surface: str = ""  # description of that surface
     placed: bool = False  # handles move it
     grip: DecalGrip = ""  # handle that the mouse drags
+    step: tuple[float, float] = (1.0, 0.0)  # size factor and turn in degrees by keys, not applied yet
     laid_for: object = field(default=None, compare=False)  # camera and placement of the mesh
     laid_at: float = field(default=0.0, compare=False)  # when the mesh was laid, on the window's clock
 
@@ -527,6 +529,11 @@ class Transient:
     def has_bar(self) -> bool:
         """True if a part is moved or pulled or a decal placed, with its own bar above the picture."""
         return self.gizmo is not None
+
+    @property
+    def takes_clicks(self) -> bool:
+        """True if a part is moved, or a decal follows the pointer, so that no tool gets the clicks."""
+        return isinstance(self.gizmo, Gizmo) or (isinstance(self.gizmo, Decal) and not self.gizmo.placed)
 
     @property
     def held_pull(self) -> Pull | None:
