@@ -245,7 +245,7 @@ def draw_cover(work: Workspace, size: tuple[int, int], area: overlay.Area, ui: U
     cover = matching[0]
     corners = (0.0, 0.0), (area.width, area.height)
     imgui.get_background_draw_list().add_image(imgui.ImTextureRef(cover.texture), *corners)
-    has_bar = view.panel and bool(view.layers or work.transient.has_bar)
+    has_bar = view.panel and (work.shows_edit or work.transient.has_bar)
     overlay.banner(cover.name, area, ui, under_bar=has_bar)
 
 

@@ -14,7 +14,7 @@ from viewer.pictures.compare import Labels
 from viewer.render import highlight
 from viewer.state.commands import Action, Plain, WithText, WithValue
 from viewer.state.layers import is_visible
-from viewer.state.transient import Gizmo, Measure
+from viewer.state.transient import Measure
 from viewer.state.view_state import (
     LARGEST_PX,
     MAX_AMPLIFIED,
@@ -212,7 +212,7 @@ def draw_options(
         The changed workspace; the y of the bar's lower edge, 0 if there is none.
     """
     view = work.view
-    if work.transient.has_bar and (isinstance(work.transient.gizmo, Gizmo) or not view.has_tool):
+    if work.transient.has_bar and (work.transient.takes_clicks or not view.has_tool):
         return work, 0.0
     measure = None if view.has_tool else work.transient.measure
     if not (view.has_tool or measure or view.painted or view.selection.count or view.selection.hidden):

@@ -215,6 +215,15 @@ class Workspace:
     session: str = ""  # name of the session file, "" before there is one
     transient: Transient = Transient()
 
+    @property
+    def shows_edit(self) -> bool:
+        """True if there is an edit to compare with the original: a layer, or the live edit of the form."""
+        form = self.form
+        is_graded = (
+            self.form_open and form.preview and form.choice.setting == "grade" and form.spec != "grade"
+        )
+        return bool(self.view.layers or self.transient.live) or is_graded
+
 
 class Store:
     """Holder of the window's workspace. The parts of the window read and replace it only here.

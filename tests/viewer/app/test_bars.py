@@ -18,6 +18,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
 from viewer.app.decal import DecalTextures
 from viewer.state.commands import Plain
+from viewer.state.forms import with_settings
 from viewer.state.workspace import start_tour, with_question, with_transient
 from viewer.ui.glfw_library import glfw
 
@@ -121,9 +122,33 @@ def test_no_bar_covers_another(app: App, folder: Path, size: str) -> None:
             assert is_beside or is_above, (state, name, one, other_name, other)
 
 
-def test_no_bar_covers_the_instruction_for_a_decal(app: App, folder: Path) -> None:
+@pytest.mark.parametrize("size", SIZES)
+def test_no_bar_covers_the_instruction_for_a_decal(app: App, folder: Path, size: str) -> None:
+    *points, zoom = SIZES[size]
+    glfw.set_window_size(app.window.handle, *points)
+    app.store.replace(replace(app.main_view.work, layout=replace(app.main_view.work.layout, zoom=zoom)))
     press(app, "Ctrl+A")
     rest(app)
     assert {"comparison", "options"} <= set(bars())
     hold_decal(app, folder)
-    assert not {"comparison", "options"} & set(bars())
+    for tool in ("", "R", "U", "I", "B", "Alt+B", "K"):
+        if tool:
+            press(app, tool)
+        rest(app)
+        assert not {"comparison", "options"} & set(bars()), tool
+
+
+def test_live_grade_has_a_comparison_without_a_layer(app: App) -> None:
+    work = app.main_view.work
+    form = with_settings(work.form, "grade:exposure=0.7")
+    assert form is not None
+    empty = replace(work, view=replace(work.view, layers=()), focus=None)
+    app.store.replace(empty)
+    rest(app)
+    assert "comparison" not in bars()
+    app.store.replace(replace(empty, form=form, form_open=True))
+    rest(app)
+    assert "comparison" in bars()
+    app.store.replace(replace(empty, form=replace(form, preview=False), form_open=True))
+    rest(app)
+    assert "comparison" not in bars(), "nothing is shown to compare"
