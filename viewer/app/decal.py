@@ -30,8 +30,10 @@ from viewer.camera.decal_warp import (
 from viewer.camera.view_camera import axes
 from viewer.render.decal_surfaces import DecalSurfaces, unhidden_frame
 from viewer.state.transient import Decal, DecalGhost, DecalGrip, Transient
+from viewer.state.workspace import Workspace, with_transient
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, u32
+from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import accent_button, checkbox, plate, small, tip
 
@@ -40,6 +42,17 @@ _INITIAL_SIZE = 0.25  # initial longer side, as a fraction of the view's height
 _STEP = 1.08  # size factor per notch of the wheel
 _TURN_DEG = 5.0  # rotation per notch of the wheel
 _SNAP_DEG = 15.0  # rotation steps while Ctrl is held
+NO_STEP = (1.0, 0.0)
+"""Step by keys that changes nothing: size factor, and turn in degrees."""
+_STEPS = {
+    "Ctrl+Up": (_STEP, 0.0),
+    "Ctrl+Down": (1.0 / _STEP, 0.0),
+    "Ctrl+Left": (1.0, _TURN_DEG),
+    "Ctrl+Right": (1.0, -_TURN_DEG),
+    "Ctrl+Shift+Left": (1.0, _SNAP_DEG),
+    "Ctrl+Shift+Right": (1.0, -_SNAP_DEG),
+}
+"""Key → size factor and turn."""
 _SIZE_RANGE_PX = (8.0, 8192.0)  # minimum and maximum, window pixels
 _MIN_ALPHA = 0.05  # smallest alpha that counts as painted
 _GHOST_ALPHA = 0.9  # opacity of a decal that is not trained yet
@@ -141,7 +154,7 @@ def draw_decal(
         draw_mesh(moved.texture, moved.mesh, pointer)
     else:
         _draw_flat(moved, pointer)
-    overlay.banner(_hint(moved, surfaces), pointer.area, pointer.ui, under_bar=pointer.shown.has_tool)
+    overlay.banner(_hint(moved, surfaces), pointer.area, pointer.ui)
     if enters or (_is_over(pointer) and imgui.is_mouse_clicked(0)):
         moved = set_decal(moved, pointer, surfaces)
     return moved, ""
@@ -256,9 +269,26 @@ def _follow_pointer(decal: Decal, pointer: PointerContext) -> Decal:
     over = _is_over(pointer)
     size = decal.size or _INITIAL_SIZE * area.height
     factor, angle = _wheel(decal.angle) if over else (1.0, decal.angle)
-    size = min(max(size * factor, _SIZE_RANGE_PX[0]), _SIZE_RANGE_PX[1])
+    key_factor, turn = decal.step
+    size = min(max(size * factor * key_factor, _SIZE_RANGE_PX[0]), _SIZE_RANGE_PX[1])
+    angle += turn
     at = (io.mouse_pos.x, io.mouse_pos.y) if over else decal.at or (area.width / 2, area.height / 2)
-    return replace(decal, size=size, angle=angle, at=at)
+    return replace(decal, size=size, angle=angle, at=at, step=NO_STEP)
+
+
+def take_keys(work: Workspace, keys: Keys) -> tuple[Workspace, Keys]:
+    """Handle the keys that scale and rotate a decal; return the unused keys."""
+    decal = work.transient.gizmo
+    if not isinstance(decal, Decal) or imgui.get_io().want_text_input:
+        return work, keys
+    for press in keys.pressed:
+        factor, turn = _STEPS.get(press.chord, NO_STEP)
+        angle = decal.angle + decal.step[1]
+        if abs(turn) == _SNAP_DEG:
+            turn = _snap(angle + turn) - angle
+        decal = replace(decal, step=(decal.step[0] * factor, decal.step[1] + turn))
+    unused = tuple(press for press in keys.pressed if press.chord not in _STEPS)
+    return with_transient(work, gizmo=decal), replace(keys, pressed=unused)
 
 
 def _wheel(angle: float) -> tuple[float, float]:
@@ -352,7 +382,7 @@ def _hint(decal: Decal, surfaces: DecalSurfaces) -> str:
         state = "Finding the surface …" if surfaces.is_busy else "No surface here"
     else:
         state = size_text(decal.frame)
-    return f"{state}   Click: place. Wheel: size. Shift+wheel: rotate, with Ctrl in steps. Esc: cancel"
+    return f"{state}   Click: place. Wheel or Ctrl+↑ ↓: size. Shift+wheel or Ctrl+← →: rotate. Esc: cancel"
 
 
 def size_text(frame: DecalFrame) -> str:
@@ -424,12 +454,15 @@ def _drag_handles(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces
         grip = under
     picture = _depth(pointer, surfaces) if under or grip else None
     frame = decal.frame
-    angle = decal.angle
-    factor = 1.0
+    factor, turn = decal.step
+    angle = decal.angle + turn
+    if decal.step != NO_STEP:
+        picture = surfaces.depth(pointer.engine.scene, pointer.camera(pointer.shown.camera), at_once=True)
     if grip and not imgui.is_mouse_clicked(0):
         factor, angle = _drag(grip, decal, frame, pointer)
     elif under and not grip:
-        factor, angle = _wheel(decal.angle)
+        notches, angle = _wheel(angle)
+        factor *= notches
     changed = replace(frame, size=frame.size * factor, angle=angle)
     x, y = _center(frame, pointer)
     io = imgui.get_io()
@@ -437,7 +470,7 @@ def _drag_handles(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces
         x += io.mouse_delta.x
         y += io.mouse_delta.y
     ended = bool(grip) and not imgui.is_mouse_down(0)
-    result = replace(decal, angle=angle, grip="" if ended else grip)
+    result = replace(decal, angle=angle, grip="" if ended else grip, step=NO_STEP)
     travels = grip == "move" and bool(io.mouse_delta.x or io.mouse_delta.y)
     if changed == frame and not travels:
         return _set_down(result, pointer) if ended else result

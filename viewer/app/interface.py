@@ -17,13 +17,14 @@ from viewer.state.transient import Pull
 from viewer.state.workspace import SceneFacts, Workspace
 from viewer.ui import key_list, overlay, tour_card
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import COMMANDS, Command, shortcut
+from viewer.ui.keys import COMMANDS, Command, Keys, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.search import find_commands
-from viewer.ui.widgets import elide, group_digits, menu, search_field
+from viewer.ui.widgets import elide, empty_line, group_digits, menu, search_field
 
-from . import color_tool, measure, mouse, select_tool
+from . import color_tool, decal, handles, measure, mouse, select_tool
 from .inspect.readouts import Distributions
+from .pull import tool as pull_tool
 from .pull.marks import draw_marks
 
 
@@ -98,8 +99,10 @@ def draw_palette(
         at = min(max(at, 0), max(len(found) - 1, 0))
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
         imgui.begin_child("found", (0.0, row * min(ROWS, max(len(found), 1))))
+        keys = list[Action]()
         if not found:
-            imgui.text_disabled("No matching command")
+            empty_line("No matching command", ("help",), ui, keys)
+        requested = next(iter(keys), None)
         for i, command in enumerate(found):
             if _command_row(command, i == at, ui):
                 requested = command.action
@@ -226,7 +229,7 @@ def draw_pill(
     """
     words, original = compared
     compare = work.view.compare
-    is_useful = work.view.layers or original or compare.mode != "off" or compare.against == PHOTOGRAPH
+    is_useful = work.shows_edit or original or compare.mode != "off" or compare.against == PHOTOGRAPH
     if work.transient.has_bar or not is_useful:
         return work, []
     scale = pointer.ui.scale
@@ -294,6 +297,13 @@ def over_picture(
         query, pressed = key_list.draw(work.help_query, free, ui)
         work = perform_actions(replace(work, help_query=query), pressed, pointer)
     return work
+
+
+def take_keys(work: Workspace, pointer: PointerContext, keys: Keys) -> tuple[Workspace, Keys]:
+    """Pass the keys to the part in hand: handles, a decal or a pull; return the unused keys."""
+    work, keys = handles.take_keys(work, pointer, keys)
+    work, keys = decal.take_keys(work, keys)
+    return pull_tool.take_keys(work, pointer, keys)
 
 
 def draw_dialog(work: Workspace, pointer: PointerContext, pressed: Sequence[str]) -> Workspace:

@@ -312,8 +312,7 @@ class MainView:
         asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
-            work, self._keys = handles.take_keys(self.work, self.pointer(), self._keys)
-            work, self._keys = pull_tool.take_keys(work, self.pointer(), self._keys)
+            work, self._keys = interface.take_keys(self.work, self.pointer(), self._keys)
             self.store.replace(work)
         self._point_by_keys(asks)
         if asks:  # no key is a shortcut or flies

@@ -41,7 +41,6 @@ from viewer.ui.widgets import (
     menu_item,
     picture,
     right_edge,
-    swatch,
     tip,
     typed_name,
     value_slider,
@@ -238,6 +237,20 @@ def draw_card(
             _focus_bar(clip, p.accent if focused else p.faint, scale)
     imgui.pop_id()
     return work, replace(touch, touched=touched or bool(press), press=press)
+
+
+def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
+    """Draw a color swatch on the current line; `edge`: with an outline."""
+    side = 12.0 * ui.scale
+    tall = imgui.get_frame_height()
+    x, y = imgui.get_cursor_screen_pos()
+    top = y + (tall - side) / 2
+    corners = (x, top), (x + side, top + side)
+    imgui.dummy((side, tall))
+    canvas = imgui.get_window_draw_list()
+    canvas.add_rect_filled(*corners, u32((*color, alpha)), 3 * ui.scale)
+    if edge:
+        canvas.add_rect(*corners, u32(PALETTE.line), 3 * ui.scale)
 
 
 def _fill_box(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> list[Action]:

@@ -119,18 +119,22 @@ def draw(
 
 
 def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
-    """Draw the histogram, with a mark at each end that clips. A press or J shows clipped colors."""
+    """Draw the histogram, with a mark at each end that clips, and the button that shows clipped colors."""
     tall = _HISTOGRAM_PX * ui.scale
     x, y = imgui.get_cursor_screen_pos()
-    wide = imgui.get_content_region_avail().x
-    pressed = imgui.invisible_button("histogram", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
+    side = imgui.get_frame_height()
+    wide = imgui.get_content_region_avail().x - side
+    imgui.dummy((wide, tall))
+    tip(f"Clipped: {100 * scope.white:.1f} % to white, {100 * scope.black:.1f} % to black")
+    imgui.same_line(0.0, 0.0)
+    imgui.set_cursor_screen_pos((x + wide, y))
+    pressed = icon_button("clipping", Icon.SHOWN, ui, dim=not form.clipping, lit=form.clipping)
+    tip("Clipped colors (J in this form)\nWhite in red, black in blue")
     key = imgui.is_window_focused() and not imgui.get_io().want_text_input
     if pressed or (key and imgui.is_key_pressed(imgui.Key.j, False)):
         form = replace(form, clipping=not form.clipping)
-    tip(
-        f"Clipped: {100 * scope.white:.1f} % to white, {100 * scope.black:.1f} % to black. "
-        "Click or J: show them in red and blue"
-    )
+    imgui.set_cursor_screen_pos((x, y))
+    imgui.dummy((wide + side, tall))
     canvas = imgui.get_window_draw_list()
     low = (x, y)
     end = (x + wide, y + tall)
@@ -143,7 +147,7 @@ def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
                 canvas.add_rect_filled((x + i * step, top), (x + (i + 1) * step, end[1]), u32(color))
     if not scope.bins:
         with imgui_ctx.push_font(None, SMALL_PX):
-            words = "Measuring the colors …"
+            words = scope.note or "Measuring the colors …"
             at = x + (wide - imgui.calc_text_size(words).x) / 2, y + (tall - imgui.get_font_size()) / 2
             canvas.add_text(at, u32(PALETTE.dim), words)
     side = 8.0 * ui.scale
@@ -203,7 +207,7 @@ def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext, actions: list[Action]
             form = with_look(form, look)
     with inert(form.spec == "grade"):
         saves = imgui.button("Save as a look", imgui.ImVec2(-1.0, 0.0))
-    tip("Keep this grade under the edit's name, as a .cube file that other programs read too")
+    tip("Keep this grade as a .cube file, named like the edit or after what it does")
     if saves:
         actions.append(Plain("save_look"))
     return form

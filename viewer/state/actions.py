@@ -52,21 +52,6 @@ from .workspace import (
 )
 
 
-def toggle_mode(view: ViewState, mode: str) -> ViewState:
-    """Switch comparison mode `mode` on, or off if it is already on."""
-    mode = "off" if view.compare.mode == mode else mode
-    return replace(view, compare=replace(view.compare, mode=mode))
-
-
-def toggle_snapshots(view: ViewState) -> ViewState:
-    """Toggle the comparison of two snapshots, as a split view if no comparison is active."""
-    compare = view.compare
-    if compare.against == "snapshots" and compare.mode != "off":
-        return replace(view, compare=replace(compare, mode="off", against="original"))
-    mode = "split" if compare.mode == "off" else compare.mode
-    return replace(view, compare=replace(compare, mode=mode, against="snapshots"))
-
-
 def end_at_edit(before: Workspace, after: Workspace) -> Workspace:
     """End a comparison of snapshots if `after` changes layers, groups or the blend rule, so that this is
     visible."""
@@ -514,6 +499,13 @@ def _new_grade(workspace: Workspace, _: None) -> Workspace:
     return replace(opened, form=with_editor(opened.form, grade), form_opening=True)
 
 
+def _toggle_clipping(workspace: Workspace, _: None) -> Workspace:
+    """Mark the colors that the form's grade clips, or stop marking them. Opens the form with a grade."""
+    if not workspace.form_open or workspace.form.choice.setting != "grade":
+        workspace = _new_grade(workspace, None)
+    return replace(workspace, form=replace(workspace.form, clipping=not workspace.form.clipping))
+
+
 GLIDES = ("frame", "home", "look")
 """Names of the commands whose camera move is animated as a glide."""
 ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
@@ -587,13 +579,16 @@ ACTIONS: dict[str, Callable[[Workspace, Any], Workspace]] = {
     "help": lambda workspace, _: replace(workspace, help=not workspace.help, help_query=""),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
-    "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
-    "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),
-    "difference": lambda w, _: replace(w, view=toggle_mode(w.view, "difference")),
-    "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)) if w.snapshots else w,
+    "beside": lambda w, _: replace(w, view=snapshots.toggle_mode(w.view, "beside")),
+    "split": lambda w, _: replace(w, view=snapshots.toggle_mode(w.view, "split")),
+    "difference": lambda w, _: replace(w, view=snapshots.toggle_mode(w.view, "difference")),
+    "compare_snapshots": lambda w, _: (
+        replace(w, view=snapshots.toggle_snapshots(w.view)) if w.snapshots else w
+    ),
     "dynamic_resolution": lambda w, _: _next_value(w, "dynamic_resolution", RESOLUTION_MODES),
     "new_edit": _new_edit,
     "new_grade": _new_grade,
+    "clipping": _toggle_clipping,
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
 }
 """Handlers of all other commands; each receives the workspace and the command's `argument`."""

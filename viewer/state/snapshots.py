@@ -127,3 +127,18 @@ def _snapshot_edit(view: ViewState) -> history.Edit:
 def _next_name(snapshots: Sequence[SliderSnapshot]) -> str:
     taken_names = {snapshot.name for snapshot in snapshots}
     return next(str(n) for n in range(1, MAX_SNAPSHOTS + 2) if str(n) not in taken_names)
+
+
+def toggle_mode(view: ViewState, mode: str) -> ViewState:
+    """Switch comparison mode `mode` on, or off if it is already on."""
+    mode = "off" if view.compare.mode == mode else mode
+    return replace(view, compare=replace(view.compare, mode=mode))
+
+
+def toggle_snapshots(view: ViewState) -> ViewState:
+    """Toggle the comparison of two snapshots, as a split view if no comparison is active."""
+    compare = view.compare
+    if compare.against == "snapshots" and compare.mode != "off":
+        return replace(view, compare=replace(compare, mode="off", against="original"))
+    mode = "split" if compare.mode == "off" else compare.mode
+    return replace(view, compare=replace(compare, mode=mode, against="snapshots"))

@@ -190,6 +190,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("paint_tool:color", "Color brush", "Alt+B", "Paint on the surface; Alt+click picks a color"),
         Command("paint_tool:clone", "Clone stamp", "Alt+C", "Alt+click sets the source to copy from"),
         Command("finish_paint", "Done painting", "Alt+Enter", "Turn the paint into a layer with a slider"),
+        Command("clipping", "Clipped colors", "", "Of the form's grade: white in red, black in blue"),
         Command("discard_paint", "Discard paint", "", "Remove all paint that is not a layer yet"),
     ),
     "Brush": (

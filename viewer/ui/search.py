@@ -1,8 +1,8 @@
-"""Search of the command palette: names, initials, everyday words, help texts and keys."""
+"""Search of the command palette by names, words, help texts and keys; and jumps in lists by letters."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from .keys import TOPICS, Command, chords
 
@@ -122,3 +122,21 @@ def find_commands(query: str, offered: Collection[str]) -> list[Command]:
             if rank is not None and command.id in offered:
                 found.append((rank, bool(command.listed), command))
     return [command for *_, command in sorted(found, key=lambda answer: answer[:2])]
+
+
+def jump_to(letters: str, titles: Sequence[str], at: int) -> int | None:
+    """Return the entry of a list that typed letters jump to; None for none.
+
+    Each letter jumps to the next title that begins with it, and after the last title to the first.
+
+    Args:
+        letters: the letters typed since the last frame
+        titles: entries of the list
+        at: the entry with the focus; −1 for none
+    """
+    found = None
+    for letter in letters:
+        order = [(at + step) % len(titles) for step in range(1, len(titles) + 1)]
+        found = next((i for i in order if titles[i].casefold().startswith(letter.casefold())), found)
+        at = at if found is None else found
+    return found

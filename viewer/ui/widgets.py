@@ -16,6 +16,7 @@ from viewer.state.workspace import Layout
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import COMMANDS, NUDGES, describe, shortcut
+from .search import jump_to
 from .tips import show_tip, wrap
 
 T = TypeVar("T")
@@ -368,12 +369,22 @@ def drop_down(
         tip(help_)
         return None
     chosen = None
+    storage = imgui.get_state_storage()
+    slot = imgui.get_id("focused entry")
+    letters = "".join(map(chr, imgui.get_io().input_queue_characters))
+    jump = jump_to(letters, titles, storage.get_int(slot, -1 if current is None else current))
     for i, title in enumerate(titles):
         color = PALETTE.faint if i in faint else PALETTE.text
         if entry(title, lines[i] if lines else "", i == current, color, ui):
             chosen = i
         if i == current:
             imgui.set_item_default_focus()
+        if i == jump:
+            imgui.internal.focus_item()
+            imgui.set_nav_cursor_visible(True)
+            imgui.set_scroll_here_y(0.5)
+        if i == jump or (jump is None and imgui.is_item_focused()):
+            storage.set_int(slot, i)
     imgui.end_combo()
     return chosen
 
@@ -517,6 +528,9 @@ def value_slider(
     return round(new, 2) if changed else value  # imgui would round an unchanged value to float32
 
 
+_BUTTON_COLORS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
+
+
 def choice(
     name: str, options: Mapping[T, str], current: T | None, ui: UiContext, wide: float = 0.0
 ) -> T | None:
@@ -555,23 +569,6 @@ def choice_row(
     if help_:
         tip(help_)
     return current if pressed is None else pressed
-
-
-def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
-    """Draw a color swatch on the current line; `edge`: with an outline."""
-    side = 12.0 * ui.scale
-    tall = imgui.get_frame_height()
-    x, y = imgui.get_cursor_screen_pos()
-    top = y + (tall - side) / 2
-    corners = (x, top), (x + side, top + side)
-    imgui.dummy((side, tall))
-    canvas = imgui.get_window_draw_list()
-    canvas.add_rect_filled(*corners, u32((*color, alpha)), 3 * ui.scale)
-    if edge:
-        canvas.add_rect(*corners, u32(PALETTE.line), 3 * ui.scale)
-
-
-_BUTTON_COLORS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
 
 
 def group_digits(count: int) -> str:

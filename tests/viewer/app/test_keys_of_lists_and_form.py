@@ -17,6 +17,7 @@ from viewer.state.forms import DeliverOptions
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 from viewer.ui.keys import KEYS, Keys, Press, next_event_id
+from viewer.ui.search import jump_to
 from viewer.ui.splash import Splash
 from viewer.ui.window import Window, glfw
 
@@ -169,6 +170,30 @@ def test_list_takes_arrows_and_enter(form: Rig) -> None:
     assert form.main_view.work.form_open
     assert form.main_view.take_requests() == ()
     assert form.main_view.work.view == before
+
+
+def test_letters_jump_in_an_open_list(form: Rig) -> None:
+    form.click(*LIST)
+    before = form.main_view.work.view
+    type_text(form, "r")  # from the whole scene to the red hat
+    type_text(form, "r")
+    strike(form, "Enter")
+    assert form.main_view.work.form.region == "red jacket"
+    form.click(*LIST)
+    type_text(form, "ws")  # the whole scene, then the shoes
+    strike(form, "Enter")
+    assert form.main_view.work.form.region == "shoes"
+    assert form.main_view.work.view == before, "no letter is a shortcut"
+
+
+def test_jump_goes_on_after_the_last_title() -> None:
+    titles = ("arm", "Red hat", "red jacket", "shoes")
+    assert jump_to("r", titles, -1) == 1
+    assert jump_to("R", titles, 1) == 2
+    assert jump_to("r", titles, 2) == 1
+    assert jump_to("ra", titles, 2) == 0
+    assert jump_to("x", titles, 0) is None
+    assert jump_to("", titles, 0) is None
 
 
 def test_escape_closes_only_the_list(form: Rig) -> None:

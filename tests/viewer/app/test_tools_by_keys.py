@@ -111,6 +111,12 @@ def test_resting_tool_requests_no_frames(tool: str) -> None:
         hand.release()
 
 
+def decal_of(hand: Rig) -> Decal:
+    decal = hand.main_view.work.transient.gizmo
+    assert isinstance(decal, Decal)
+    return decal
+
+
 def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
     pixels = np.zeros((40, 80, 4), np.uint8)
     pixels[10:30, 20:60] = 200, 30, 30, 255
@@ -124,9 +130,24 @@ def test_decal_is_placed_by_keys(tmp_path: Path) -> None:
         for chord in WAY:
             hand.key(chord)
         assert isinstance(hand.main_view.work.transient.gizmo, Decal)
-        assert hand.main_view.work.transient.gizmo.at == places(MIDDLE, WAY)[-1]
+        first = hand.main_view.work.transient.gizmo
+        assert first.at == places(MIDDLE, WAY)[-1]
+        for chord in ("Ctrl+Up", "Ctrl+Up", "Ctrl+Down", "Ctrl+Left", "Ctrl+Shift+Left"):
+            hand.key(chord)
+        sized = decal_of(hand)
+        assert sized.at == first.at
+        assert (sized.size, sized.angle) == (pytest.approx(1.08 * first.size), 15.0)
         hand.key("Space")
-        assert hand.main_view.work.transient.gizmo.placed
+        placed = decal_of(hand)
+        assert placed.placed
+        assert placed.frame is not None
+        hand.key("Ctrl+Up")
+        hand.key("Ctrl+Right")
+        changed = decal_of(hand)
+        assert changed.frame is not None
+        assert changed.frame.size == pytest.approx(1.08 * placed.frame.size)
+        assert changed.frame.angle == changed.angle == 10.0
+        assert changed.mesh is not None
         hand.key("Enter")
         assert Plain("lay_decal") in hand.main_view.take_requests()
 

@@ -18,7 +18,7 @@ from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import half_camera, to_camera
-from viewer.state.actions import toggle_mode
+from viewer.state.snapshots import toggle_mode
 from viewer.state.view_state import Comparison, ViewState
 
 

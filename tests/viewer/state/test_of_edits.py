@@ -17,6 +17,7 @@ from viewer.state.commands import OnItem, Plain
 from viewer.state.forms import ALL, TYPED
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import SceneFacts, Workspace
+from viewer.ui import key_list
 
 pytestmark = pytest.mark.gl
 SCARF = 0
@@ -75,6 +76,14 @@ def test_new_grade_opens_the_form_with_a_grade(hand: Rig) -> None:
     opened = perform(work, Plain("new_grade"), hand.main_view.facts)
     assert (opened.form_open, opened.form.choice.kind) == (True, "grade")
     assert perform(opened, Plain("new_grade"), hand.main_view.facts).form_open
+
+
+def test_clipped_colors_are_marked_in_the_form_of_a_grade(hand: Rig) -> None:
+    facts = hand.main_view.facts
+    marked = perform(hand.main_view.work, Plain("clipping"), facts)
+    assert (marked.form_open, marked.form.choice.kind, marked.form.clipping) == (True, "grade", True)
+    assert not perform(marked, Plain("clipping"), facts).form.clipping
+    assert any(key == "J" and "Clipped" in text for topic in key_list.topics() for key, text in topic.rows)
 
 
 def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:
