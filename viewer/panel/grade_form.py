@@ -123,18 +123,19 @@ def _histogram(form: NewEdit, scope: GradeScope, ui: UiContext) -> NewEdit:
     tall = _HISTOGRAM_PX * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     side = imgui.get_frame_height()
-    wide = imgui.get_content_region_avail().x - side
+    gap = 4.0 * ui.scale
+    wide = imgui.get_content_region_avail().x - side - gap
     imgui.dummy((wide, tall))
     tip(f"Clipped: {100 * scope.white:.1f} % to white, {100 * scope.black:.1f} % to black")
     imgui.same_line(0.0, 0.0)
-    imgui.set_cursor_screen_pos((x + wide, y))
+    imgui.set_cursor_screen_pos((x + wide + gap, y))
     pressed = icon_button("clipping", Icon.SHOWN, ui, dim=not form.clipping, lit=form.clipping)
     tip("Clipped colors (J in this form)\nWhite in red, black in blue")
     key = imgui.is_window_focused() and not imgui.get_io().want_text_input
     if pressed or (key and imgui.is_key_pressed(imgui.Key.j, False)):
         form = replace(form, clipping=not form.clipping)
     imgui.set_cursor_screen_pos((x, y))
-    imgui.dummy((wide + side, tall))
+    imgui.dummy((wide + gap + side, tall))
     canvas = imgui.get_window_draw_list()
     low = (x, y)
     end = (x + wide, y + tall)

@@ -30,18 +30,9 @@ MOUSE_HELP = (
     ("Ctrl+click it", "Type a value"),
     ("Double-click it", "Reset"),
     ("Right-click", "Menu; cancels a drag"),
-)
-
-FORM_HELP = (
-    ("Tab, Shift+Tab", "Next, previous field"),
-    ("← →", "Move a slider"),
     ("Letters", "Jump in an open list"),
-    ("J", "Clipped colors of a grade"),
-    ("Ctrl+Enter", "Train"),
-)
-DECAL_HELP = (
-    ("Ctrl+↑ ↓", "Larger, smaller"),
-    ("Ctrl+← →", "Rotate; Shift in steps of 15°"),
+    ("J in a grade", "Mark clipped colors"),
+    ("Ctrl+↑ ↓ ← →", "Decal: scale, rotate"),
 )
 
 _MAC = (("Cmd", "Is Ctrl here; both work"),)
@@ -73,8 +64,7 @@ class Topic:
 def topics() -> tuple[Topic, ...]:
     """Return all commands by topic, each once."""
     mouse = Topic("Mouse", MOUSE_HELP + (_MAC if has_command_key() else ()))
-    commands = [Topic(name, tuple(dict.fromkeys(_lines(rows)))) for name, rows in TOPICS.items()]
-    return mouse, *commands, Topic("Form and lists", FORM_HELP), Topic("Decal", DECAL_HELP)
+    return mouse, *(Topic(name, tuple(dict.fromkeys(_lines(commands)))) for name, commands in TOPICS.items())
 
 
 def find_rows(query: str) -> tuple[Topic, ...]:

@@ -83,7 +83,9 @@ def test_clipped_colors_are_marked_in_the_form_of_a_grade(hand: Rig) -> None:
     marked = perform(hand.main_view.work, Plain("clipping"), facts)
     assert (marked.form_open, marked.form.choice.kind, marked.form.clipping) == (True, "grade", True)
     assert not perform(marked, Plain("clipping"), facts).form.clipping
-    assert any(key == "J" and "Clipped" in text for topic in key_list.topics() for key, text in topic.rows)
+    assert any(
+        key == "J in a grade" and "clipped" in text for topic in key_list.topics() for key, text in topic.rows
+    )
 
 
 def test_again_ignores_edits_that_no_form_editor_made(hand: Rig) -> None:

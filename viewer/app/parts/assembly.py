@@ -175,7 +175,7 @@ def make_parts(
     scene_list = SceneListActions(
         store=store, documents=documents, messages=messages, wait_for=wait_for, open_file=file_actions.open
     )
-    maker, tidy, pulling = _manual_edits(main_view, documents, edits, scene_list)
+    maker, tidy, pulling, searches = _manual_edits(main_view, documents, edits, scene_list)
     return WindowParts(
         file_actions=file_actions,
         pictures=pictures,
@@ -185,13 +185,7 @@ def make_parts(
         start=start,
         scene_list=scene_list,
         up=UpActions(store=store, documents=documents, messages=messages),
-        searches=SearchActions(
-            store=store,
-            documents=documents,
-            messages=messages,
-            pointer=main_view.pointer,
-            wake=wake_window,
-        ),
+        searches=searches,
         maker=maker,
         tidy=tidy,
         painting=PaintingActions(store=store, documents=documents, messages=messages, queue=jobs.queue),
@@ -201,8 +195,8 @@ def make_parts(
 
 def _manual_edits(
     main_view: MainView, documents: DocumentStore, edits: EditActions, scene_list: SceneListActions
-) -> tuple[LayerMaker, TidyActions, PullActions]:
-    """Return the parts that edit the selection by hand."""
+) -> tuple[LayerMaker, TidyActions, PullActions, SearchActions]:
+    """Return the parts that edit the selection by hand, and that find its Gaussians."""
     store = main_view.store
     messages = main_view.messages
     maker = LayerMaker(store=store, documents=documents, messages=messages, edits=edits, wake=wake_window)
@@ -216,4 +210,7 @@ def _manual_edits(
     pulling = PullActions(
         store=store, documents=documents, maker=maker, engine=lambda: main_view.engine, wake=wake_window
     )
-    return maker, tidy, pulling
+    searches = SearchActions(
+        store=store, documents=documents, messages=messages, pointer=main_view.pointer, wake=wake_window
+    )
+    return maker, tidy, pulling, searches
