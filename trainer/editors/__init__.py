@@ -255,4 +255,8 @@ def make_editor(
         ProgdfError: the editor cannot be made.
     """
     row = editor_row(options)
-    return row.make(EditorInput(options.text, scene, region, views, options, glances, seen, say, waiting))
+    return row.make(
+        EditorInput(
+            options.text, scene, region, views, options, glances=glances, seen=seen, say=say, waiting=waiting
+        )
+    )
