@@ -26,6 +26,11 @@ Rounding alone can cause it, so smaller errors are not certain to be visible on 
 """
 
 
+def round_to_8_bits(values: Tensor) -> Tensor:
+    """Return values rounded to those that 8 bits hold. Values outside 0 to 1 are clamped. Any shape"""
+    return (values.clamp(0.0, 1.0) * 255.0).round() / 255.0
+
+
 def decibels(mse: float) -> float:
     """Return the PSNR in dB of a mean squared error (images of range 0 to 1), at most `NO_DIFFERENCE`."""
     return NO_DIFFERENCE if mse <= 0 else min(NO_DIFFERENCE, -10 * math.log10(mse))

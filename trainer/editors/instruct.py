@@ -16,6 +16,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.picture_camera import find_picture_camera
+from progdf.metrics.image import round_to_8_bits
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
@@ -114,7 +115,7 @@ class InstructEditor(FramePainter):
                 request.strength,
                 request.softness,
             )
-        return (painted * 255.0).round() / 255.0
+        return round_to_8_bits(painted)
 
 
 def instruct(given: EditorInput) -> InstructEditor:

@@ -33,7 +33,7 @@ from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import map_colors, member_bands
-from progdf.metrics.image import LEVEL, decibels
+from progdf.metrics.image import LEVEL, decibels, round_to_8_bits
 from progdf.sh import C0
 from progdf.system.equality import equal_fields
 from progdf.threads import one_thread
@@ -186,7 +186,7 @@ class Solver:
         """Return the solver with the mask that fits these pictures of the views best, in steps of 1/255."""
         full = map_colors(self.sh, self.maps.solve(1, targets), 1) - self.sh
         share = torch.where(self.asked[:, 0], improve_mask(self.views, full, self.share, targets), self.share)
-        return self.with_mask((share * 255.0).round() / 255.0)
+        return self.with_mask(round_to_8_bits(share))
 
     def only(self, residual: Tensor) -> Solver:
         """Return the solver for residuals that stay 0 beyond DC where this one is 0. [M,b,3]"""
