@@ -37,6 +37,7 @@ BENCHES: dict[str, str] = {
     "pull-stages": "benchmarks.layers.pull_stages:tables",
     "pull-parts": "benchmarks.layers.pull_parts:tables",
     "edits": "benchmarks.edits:tables",
+    "sliders": "benchmarks.sliders:tables",
     "networks": "benchmarks.networks:tables",
     "viewer": "benchmarks.viewer.slider:tables",
     "select": "benchmarks.viewer.selection:tables",
@@ -78,7 +79,7 @@ class BenchOptions:
     markdown: tuple[Path, ...] = ()
     """Also put the tables between their markers in these Markdown files."""
     runs: tuple[Path, ...] = ()
-    """Finished run folders for `edits` and `networks`."""
+    """Finished run folders for `edits` and `networks`; for `sliders` the folder of the suite."""
     plots: Path | None = None
     """Folder for the pictures of `training`, `field` and `subject` (.png) and `recolors` (.jpg)."""
     scenes: tuple[Path, ...] = ()
@@ -113,7 +114,7 @@ def main(argv: Sequence[str]) -> int:
     plotted = (*charted, "recolors", "subject")
     if options.plots and options.what and not set(plotted) & set(options.what):
         raise ProgdfError(f"--plots are for {', '.join(plotted)}; use python -m benchmarks {plotted[0]}")
-    trained = ("edits", "networks")
+    trained = ("edits", "networks", "sliders")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
     drawing = (

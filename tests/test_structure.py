@@ -39,7 +39,7 @@ ORDER = {
         motion optimize paper fit methods report preview run evaluate batch cli""",
     "viewer": "camera gl state jobs render web files widget __init__ pictures ui panel app commands",
     "benchmarks": """__init__ analytic_warps courses table ablation rasterizer training
-        recorded_runs viewer colors layers files field edits networks motion pictures spill
+        recorded_runs viewer colors layers files field edits sliders networks motion pictures spill
         editors __main__""",
 }
 

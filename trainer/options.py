@@ -360,9 +360,9 @@ class EvaluateOptions:
 
     run: tyro.conf.Positional[Path]
     """Folder of a run of progdf train or progdf batch; with --suite a folder for its files."""
-    suite: Annotated[Literal["sliders"] | None, absent_option("sliders", "measure a run")] = None
-    """Train and compare methods on ten edits whose pictures are known at every strength."""
-    methods: Annotated[tuple[str, ...], absent_option("NAME", "field keyframes matrix")] = ()
+    suite: Annotated[Literal["sliders", "sliders-1"] | None, absent_option("sliders", "measure a run")] = None
+    """Compare methods on ten edits with known pictures: the current suite, or its version 1."""
+    methods: Annotated[tuple[str, ...], absent_option("NAME", "all; version 1 without paper")] = ()
     """--suite: field, keyframes, matrix, paper, or your own function as package.module:function."""
     seed: int = 0
     """--suite: random seed of the trainings, 0 to 2³² − 1."""

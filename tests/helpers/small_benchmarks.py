@@ -25,7 +25,7 @@ from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
 from tests.helpers import demo_scenes, drawn
-from trainer.evaluate.suite import run as suite
+from trainer.evaluate.suite.edits import SUITES
 from trainer.options import TrainingViewOptions
 from trainer.run import demo
 from trainer.run.demo import Effort
@@ -117,11 +117,16 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
 
 
 def shrink_suite(patch: pytest.MonkeyPatch) -> None:
-    """Make `progdf evaluate --suite sliders` take seconds: one edit of a small bear."""
-    blue = next(edit for edit in suite.EDITS if edit.name == "blue scarf")
-    patch.setattr(suite, "EDITS", (blue,))
-    patch.setattr(suite, "SIZES", {"bear": 1000})
-    patch.setattr(suite, "EFFORT", Effort(views=6, image_size=48, steps=32))
+    """Make `progdf evaluate --suite sliders` take seconds: one edit of a small bear, without the paper."""
+    whole = SUITES["sliders"]
+    small = replace(
+        whole,
+        edits=whole.edits[:1],
+        sizes={"bear": 1000},
+        effort=Effort(views=6, image_size=48, steps=32),
+        methods=("field", "keyframes", "matrix"),
+    )
+    patch.setitem(SUITES, "sliders", small)  # type: ignore[misc]
 
 
 _tasks = training.tasks

@@ -18,7 +18,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from progdf.errors import ProgdfError
 from progdf.metrics import lpips
-from progdf.metrics.image import edge_weights, psnr, ssim
+from progdf.metrics.image import edge_weights, psnr, round_to_8_bits, ssim
 from progdf.metrics.lpips import Lpips
 from progdf.metrics.slider import Pictures, slider_statistics, visible_change
 
@@ -316,3 +316,12 @@ def test_visible_change_is_limited_to_the_mask() -> None:
     mask = torch.zeros(4, 4, dtype=torch.bool)
     mask[:2] = True
     assert visible_change(a, b, [mask]) == pytest.approx(0.25)
+
+
+def test_rounded_values_are_levels_of_8_bits() -> None:
+    levels = torch.arange(256) / 255.0
+    assert torch.equal(round_to_8_bits(levels), levels)
+    values = torch.linspace(-0.2, 1.2, 1001)
+    rounded = round_to_8_bits(values)
+    assert torch.equal((rounded * 255.0).round() / 255.0, rounded)
+    assert (rounded - values.clamp(0.0, 1.0)).abs().max() <= 0.5 / 255 + 1e-6

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,31 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.helpers.demo_scenes import bear
-from trainer.evaluate.suite.analytic_edits import bear_edits
-from trainer.evaluate.suite.edits import EDITS, EditTask, load_made_scene, make_task
+from tests.helpers.paths import ROOT
+from trainer.evaluate.suite.analytic_edits import FORMULAS, fade_edit
+from trainer.evaluate.suite.edits import SUITES, EditTask, Suite, make_task
 from trainer.evaluate.suite.methods import METHODS, Slider, find_methods
-from trainer.evaluate.suite.results import EditResult, bootstrap, edit_table, suite_picture, summary_table
+from trainer.evaluate.suite.results import (
+    EditResult,
+    bootstrap,
+    edit_rows,
+    read_results,
+    suite_picture,
+    summary_rows,
+)
 from trainer.evaluate.suite.run import run_suite
+from trainer.evaluate.suite.scenes import CAPTURES, FOLDER, MADE, load_suite_scene
 from trainer.optimize.losses import GradientL1
 from trainer.run.demo import Effort
 from trainer.views.view import render_view
 
-_USED = tuple(edit for edit in EDITS if edit.name in ("blue scarf", "tilted ears"))
-_EFFORT = Effort(views=6, image_size=64, steps=32)
+_FIRST = SUITES["sliders-1"]
+_SMALL = replace(
+    _FIRST,
+    edits=tuple(edit for edit in _FIRST.edits if edit.name in ("blue scarf", "tilted ears")),
+    sizes={"bear": 1500},
+    effort=Effort(views=6, image_size=64, steps=32),
+)
 
 
 def _original(task: EditTask) -> Slider:
@@ -34,7 +50,7 @@ def _original(task: EditTask) -> Slider:
 
 def _run(folder: Path) -> list[EditResult]:
     methods = {**find_methods(["field", "keyframes", "matrix"]), "original": _original}
-    return run_suite(folder, methods, GradientL1(), 0, 1, edits=_USED, sizes={"bear": 1500}, effort=_EFFORT)
+    return run_suite(folder, methods, GradientL1(), 0, 1, suite=_SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +77,8 @@ def test_every_method_is_exact_at_zero_and_the_field_is_best(
         for name, errors in result.errors.items():
             assert errors["psnr"][:, 0].min() > 80, name  # the file's pictures have no rounding here
             assert name == "field" or between[name] < between["field"]
-    lines = edit_table(suite[1]).splitlines()[2:] + summary_table(suite[1], "lpips").splitlines()[2:]
-    assert [line.split(" | ")[0][2:] for line in lines] == [e.name for e in _USED] + list(result.errors)
+    assert [row["edit"] for row in edit_rows(suite[1])] == [edit.name for edit in _SMALL.edits]
+    assert [row["method"] for row in summary_rows(suite[1], "lpips")] == list(result.errors)
     assert suite_picture(suite[1]).shape[2] == 3
 
 
@@ -82,9 +98,9 @@ def test_same_seed_gives_the_same_file_apart_from_times(
 
 
 def _small_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> EditTask:
-    monkeypatch.setitem(load_made_scene.__globals__["_MAKERS"], "bear", bear)  # built once for many tests
-    made = load_made_scene(folder, "bear", 700)
-    return make_task(_USED[0], made, folder, Effort(views=6, image_size=64, steps=0), 1, 0)[0]
+    monkeypatch.setitem(MADE, "bear", bear)  # type: ignore[arg-type]  # built once for many tests
+    made = load_suite_scene(folder, "bear", 700)
+    return make_task(_SMALL.edits[0], made, folder, Effort(views=6, image_size=64, steps=0), 1, 0)[0]
 
 
 def test_matrix_recovers_an_affine_edit_of_the_colors(
@@ -157,14 +173,73 @@ def test_failing_method_is_one_line_with_its_name(tmp_path: Path) -> None:
     def wrong(task: EditTask) -> Slider:
         return lambda strength: strength  # type: ignore[return-value]
 
-    small = {"edits": _USED[:1], "sizes": {"bear": 700}, "effort": Effort(views=6, image_size=48, steps=0)}
+    small = _one_edit(Effort(views=6, image_size=48, steps=0))
     with pytest.raises(ProgdfError, match=r"broken failed at blue scarf .IndexError: no such view"):
-        run_suite(tmp_path, {"broken": broken}, GradientL1(), **small)  # type: ignore[arg-type]
+        run_suite(tmp_path, {"broken": broken}, GradientL1(), suite=small)
     with pytest.raises(ProgdfError, match="returned a float"):
-        run_suite(tmp_path, {"wrong": wrong}, GradientL1(), **small)  # type: ignore[arg-type]
+        run_suite(tmp_path, {"wrong": wrong}, GradientL1(), suite=small)
 
 
-def test_every_analytic_edit_of_the_suite_is_a_bear_edit() -> None:
-    edits = bear_edits(bear(1500))
-    assert {edit.name for edit in EDITS if not edit.editor} <= set(edits)
-    assert len({edit.folder for edit in EDITS}) == len(EDITS)
+def _one_edit(effort: Effort) -> Suite:
+    return replace(_SMALL, edits=_SMALL.edits[:1], sizes={"bear": 700}, effort=effort)
+
+
+def test_results_are_read_back_from_their_file(tmp_path: Path) -> None:
+    small = _one_edit(Effort(views=6, image_size=48, steps=0))
+    written = run_suite(tmp_path, {"original": _original}, GradientL1(), suite=small)
+    read, rest = read_results(tmp_path / "sliders.json")
+    assert edit_rows(read) == edit_rows(written)
+    assert rest["version"] == 1
+    cells = [list(row.values())[:-1] for row in summary_rows(read, "lpips")]  # the last are seconds
+    assert cells == [list(row.values())[:-1] for row in summary_rows(written, "lpips")]
+    (tmp_path / "sliders.json").write_text("{}")
+    with pytest.raises(ProgdfError, match="is damaged"):
+        read_results(tmp_path / "sliders.json")
+    with pytest.raises(ProgdfError, match="does not exist"):
+        read_results(tmp_path / "other.json")
+
+
+@pytest.mark.parametrize("name", sorted(SUITES))
+def test_every_analytic_edit_of_a_suite_has_a_formula(name: str) -> None:
+    edits = SUITES[name].edits
+    scenes = {edit.scene for edit in edits}
+    labeled = {one: bear(1500) if one == "bear" else CAPTURES[one].load() for one in scenes - {"room"}}
+    for edit in edits:
+        if not edit.editor:
+            assert edit.name in FORMULAS[edit.scene](labeled[edit.scene])
+    assert len({edit.folder for edit in edits}) == len(edits)
+
+
+def test_first_version_is_as_it_was_published() -> None:
+    """Version 1 is fixed: this is the digest of its edits, sizes and effort."""
+    text = repr((_FIRST.version, _FIRST.edits, dict(_FIRST.sizes), _FIRST.effort))
+    assert hashlib.sha256(text.encode()).hexdigest()[:16] == "9c365eb965815967"
+
+
+@pytest.mark.parametrize("name", sorted(CAPTURES))
+def test_capture_is_the_credited_file_of_the_tutorials(name: str) -> None:
+    capture = CAPTURES[name]
+    for file in filter(None, (capture.file, capture.labels)):
+        assert (FOLDER / file).read_bytes() == (ROOT / "assets/scenes" / file).read_bytes()
+        assert f"| {file} |" in (FOLDER / "CREDITS.md").read_text(encoding="utf-8")
+    scene = capture.load()
+    for edit in SUITES["sliders"].edits:
+        if edit.scene == name:
+            # the paper's network takes processor time with the number of members
+            assert 300 < len(scene.members(*edit.parts)) < 1200
+
+
+def test_another_capture_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.evaluate.suite.scenes.FOLDER", tmp_path)
+    shutil.copy(FOLDER / "robot.compressed.ply", tmp_path / "box.sog")
+    with pytest.raises(ProgdfError, match="is not the file of the suite"):
+        CAPTURES["box"].load()
+
+
+def test_faded_part_is_gone_at_one_and_whole_at_zero() -> None:
+    scene = bear(700).gaussians
+    members = torch.arange(50)
+    half = fade_edit().apply(scene, members, 0.5)
+    assert torch.allclose(half.opacities[:50], 0.5 * scene.opacities[:50], atol=1e-5)
+    assert torch.equal(half.logit_opacities[50:], scene.logit_opacities[50:])
+    assert fade_edit().apply(scene, members, 1.0).opacities[:50].max() < 1e-5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -90,6 +90,15 @@ def darken_edit(stops: float = 3.0) -> AnalyticEdit:
         return replace(part, sh0=rgb_to_sh0(dark), shN=part.shN * 2 ** (-stops * strength / 2.2))
 
     return AnalyticEdit("night", change)
+
+
+def fade_edit() -> AnalyticEdit:
+    """Make an edit that removes: the opacity falls linearly to 0."""
+
+    def change(part: Gaussians, strength: float) -> Gaussians:
+        return replace(part, logit_opacities=(part.opacities * (1 - strength)).logit(eps=1e-6))
+
+    return AnalyticEdit("fade", change)
 
 
 def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> AnalyticEdit:
@@ -222,6 +231,31 @@ def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
         "bent ears": (bend_edit(60.0, torch.tensor([1.0, 0.0, 0.0]), scene.up, roots[0], 0.3), ears),
         "night": (darken_edit(), torch.arange(len(scene.gaussians))),
     }
+
+
+def robot_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
+    """Return the edits of the capture `robot` by name: (edit, members)."""
+    hand = scene.members("left hand")
+    shoulder = scene.gaussians.means[scene.members("body")].mean(0, keepdim=True)
+    return {
+        "raised hand": (swing_edit(30.0, torch.tensor([0.0, 0.0, 1.0]), shoulder), hand),
+        "fading hand": (fade_edit(), hand),
+    }
+
+
+def box_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
+    """Return the edits of the capture `box` by name: (edit, members)."""
+    letters = scene.members("letters")
+    center = scene.gaussians.means[letters].mean(0, keepdim=True)
+    return {"moved letters": (scale_edit(1.0, center, torch.tensor([0.0, -0.08, 0.0])), letters)}
+
+
+FORMULAS: Mapping[str, Callable[[DemoScene], dict[str, tuple[AnalyticEdit, Tensor]]]] = {
+    "bear": bear_edits,
+    "robot": robot_edits,
+    "box": box_edits,
+}
+"""Analytic edits by scene."""
 
 
 def _ear_roots(means: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Edits of the suite `sliders`: made scenes whose pictures are known at every strength.
+"""Edits of the suite `sliders`: scenes whose pictures are known at every strength.
 
 A color editor defines every view at any strength, and an analytic edit every Gaussian. A method receives
 pictures of the training views at 8 strengths. It is compared in other views at 11 strengths.
@@ -7,31 +7,27 @@ pictures of the training views at 8 strengths. It is compared in other views at 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import DemoScene, bear, room
-from progdf.formats.ply import load_ply
+from progdf.demo_scenes import DemoScene
 from progdf.gaussians import Gaussians
+from progdf.metrics.image import round_to_8_bits
 from progdf.metrics.slider import Pictures
 from progdf.region import Region
 from progdf.system.equality import equal_fields
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.options import EditorOptions, TrainingViewOptions
-from trainer.run.demo import Effort, write_scene
+from trainer.run.demo import Effort
 from trainer.views.setup import TrainingSetup, make_training_setup, render_thumbnails
 from trainer.views.view import View, crop, render_view
 
-from .analytic_edits import bear_edits
-
-VERSION = 1
-"""Version of the suite. A change of an edit, a scene, a view or a measure raises it."""
+from .analytic_edits import FORMULAS
 
 GIVEN = tuple((i + 1) / 8 for i in range(8))
 """Strengths at which a method receives pictures; at 0 they are the views of the original."""
@@ -39,21 +35,13 @@ GIVEN = tuple((i + 1) / 8 for i in range(8))
 STRENGTHS = tuple(i / 10 for i in range(11))
 """Strengths at which a method is compared with the truth."""
 
-SIZES = {"bear": 12_000, "room": 20_000}
-"""Number of Gaussians by scene."""
-
-EFFORT = Effort(views=24, image_size=192, steps=480)
-"""Number of views, a sixth of which are held out, their longer side in pixels, and steps of a training."""
-
-_MAKERS = {"bear": bear, "room": room}
-
 
 @dataclass(frozen=True)
 class KnownEdit:
-    """An edit of a made scene with known pictures."""
+    """An edit with known pictures."""
 
-    name: str  # name of the edit; for an analytic one, its name in `bear_edits`
-    scene: Literal["bear", "room"]  # the made scene
+    name: str  # name of the edit; for an analytic one, its name in `FORMULAS`
+    scene: str  # a made scene or a capture, see `scenes`
     parts: tuple[str, ...]  # labels of the region
     editor: str = ""  # `KIND:WHAT` of a color editor; "" for an analytic edit
 
@@ -63,20 +51,62 @@ class KnownEdit:
         return self.name.replace(" ", "-")
 
 
+@dataclass(frozen=True)
+class Suite:
+    """One version of the suite, which never changes, so that its results stay comparable.
+
+    Another edit, scene, view or measure is another version.
+    """
+
+    version: int
+    edits: tuple[KnownEdit, ...]
+    sizes: Mapping[str, int]  # number of Gaussians of each made scene
+    # number of views, a sixth of which are held out, their longer side in pixels, and steps of a training
+    effort: Effort
+    methods: tuple[str, ...]  # methods by default
+
+
 _COAT = ("body", "head", "ears", "arms", "legs")
-EDITS = (
-    KnownEdit("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
-    KnownEdit("gold coat", "bear", _COAT, "recolor:#d89a12"),
-    KnownEdit("tinted coat", "bear", _COAT, "tint:#4f6fd8"),
-    KnownEdit("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
-    KnownEdit("night", "bear", (*_COAT, "scarf", "plinth", "grass"), "night"),
-    KnownEdit("blue rug", "room", ("rug",), "recolor:#3a55b4"),
-    KnownEdit("big ears", "bear", ("ears",)),
-    KnownEdit("tilted ears", "bear", ("ears",)),
-    KnownEdit("long ears", "bear", ("ears",)),
-    KnownEdit("bent ears", "bear", ("ears",)),
-)
-"""The edits of the suite."""
+SUITES: Mapping[str, Suite] = {
+    # small regions, as the paper's network takes processor time with the number of members
+    "sliders": Suite(
+        version=2,
+        edits=(
+            KnownEdit("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
+            KnownEdit("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
+            KnownEdit("big ears", "bear", ("ears",)),
+            KnownEdit("bent ears", "bear", ("ears",)),
+            KnownEdit("green hand", "robot", ("right hand",), "tint:#30b060"),
+            KnownEdit("dark head", "robot", ("head",), "darken:0.75"),
+            KnownEdit("raised hand", "robot", ("left hand",)),
+            KnownEdit("fading hand", "robot", ("left hand",)),
+            KnownEdit("red letters", "box", ("letters",), "recolor:#b02020"),
+            KnownEdit("moved letters", "box", ("letters",)),
+        ),
+        sizes={"bear": 5_000},
+        effort=Effort(views=24, image_size=128, steps=160),
+        methods=("field", "keyframes", "matrix", "paper"),
+    ),
+    "sliders-1": Suite(
+        version=1,
+        edits=(
+            KnownEdit("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
+            KnownEdit("gold coat", "bear", _COAT, "recolor:#d89a12"),
+            KnownEdit("tinted coat", "bear", _COAT, "tint:#4f6fd8"),
+            KnownEdit("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
+            KnownEdit("night", "bear", (*_COAT, "scarf", "plinth", "grass"), "night"),
+            KnownEdit("blue rug", "room", ("rug",), "recolor:#3a55b4"),
+            KnownEdit("big ears", "bear", ("ears",)),
+            KnownEdit("tilted ears", "bear", ("ears",)),
+            KnownEdit("long ears", "bear", ("ears",)),
+            KnownEdit("bent ears", "bear", ("ears",)),
+        ),
+        sizes={"bear": 12_000, "room": 20_000},
+        effort=Effort(views=24, image_size=192, steps=480),
+        methods=("field", "keyframes", "matrix"),
+    ),
+}
+"""Versions of the suite by their name on the command line. The first is the current one."""
 
 
 @dataclass(frozen=True)
@@ -117,32 +147,21 @@ class KnownTruth:
         return [crop(picture, crop_scene.box).clamp(0, 1) for picture, crop_scene in crops]
 
 
-def load_made_scene(folder: Path, name: str, size: int) -> DemoScene:
-    """Write a made scene to FOLDER/NAME, and return it as its file holds it.
-
-    Raises:
-        ProgdfError: the folder cannot be written to.
-    """
-    made = _MAKERS[name](size)
-    write_scene(folder / name, made)
-    return replace(made, gaussians=load_ply(folder / name / "scene.ply"))
-
-
 def make_task(
-    edit: KnownEdit, made: DemoScene, folder: Path, effort: Effort, threads: int, seed: int
+    edit: KnownEdit, labeled: DemoScene, folder: Path, effort: Effort, threads: int, seed: int
 ) -> tuple[EditTask, KnownTruth]:
     """Return an edit as a method receives it, and its truth.
 
     Args:
         edit: the edit
-        made: its scene
+        labeled: its scene
         folder: folder of the suite, which holds the scene
         effort: views, image size and steps of a training
         threads: CPU threads; 0: all cores
         seed: seed for random numbers
     """
-    scene = made.gaussians
-    members = made.members(*edit.parts)
+    scene = labeled.gaussians
+    members = labeled.members(*edit.parts)
     score = torch.zeros(len(scene)).index_fill(0, members, 1.0)
     region = Region(edit.folder, members, score)
     cameras = folder / edit.scene / "cameras.json" if edit.scene == "room" else None  # its cameras are inside
@@ -151,8 +170,8 @@ def make_task(
         cameras, views=effort.views, image_size=effort.image_size, dense=is_color, fills=is_color
     )
     setup = make_training_setup(options, scene, region)
-    true_pictures = _true_pictures(edit, made, setup, options)
-    given = {s: [_round_to_8_bits(picture) for picture in true_pictures(s, setup.train)] for s in GIVEN}
+    true_pictures = _true_pictures(edit, labeled, setup, options)
+    given = {s: [round_to_8_bits(picture) for picture in true_pictures(s, setup.train)] for s in GIVEN}
     task = EditTask(
         name=edit.name,
         scene=scene,
@@ -174,14 +193,14 @@ _TruePictures = Callable[[float, Sequence[View]], list[Tensor]]
 
 
 def _true_pictures(
-    edit: KnownEdit, made: DemoScene, setup: TrainingSetup, options: TrainingViewOptions
+    edit: KnownEdit, labeled: DemoScene, setup: TrainingSetup, options: TrainingViewOptions
 ) -> _TruePictures:
-    scene = made.gaussians
+    scene = labeled.gaussians
     if edit.editor:
         glances = partial(render_thumbnails, options, scene, setup.region)
         editor = make_editor(EditorOptions(edit.editor), scene, setup.region, setup.views, glances)
         return lambda s, views: [editor.edit(view, s) for view in views]
-    formula = bear_edits(made)[edit.name][0]
+    formula = FORMULAS[edit.scene](labeled)[edit.name][0]
 
     def pictures(s: float, views: Sequence[View]) -> list[Tensor]:
         edited = formula.apply(scene, setup.region.members, s)
@@ -200,7 +219,3 @@ def _known_truth(setup: TrainingSetup, true_pictures: _TruePictures) -> KnownTru
         return [crop(picture, box) for picture, box in zip(true_pictures(s, views), crop_boxes, strict=True)]
 
     return KnownTruth(evaluator, views, setup.background, boxes)
-
-
-def _round_to_8_bits(picture: Tensor) -> Tensor:
-    return (picture.clamp(0, 1) * 255).round() / 255

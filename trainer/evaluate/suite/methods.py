@@ -115,9 +115,6 @@ METHODS: Mapping[str, SliderMethod] = {
 }
 """Built-in methods by name."""
 
-DEFAULT_METHODS = ("field", "keyframes", "matrix")
-"""Methods that take minutes; `paper` takes hours."""
-
 
 def find_methods(names: Sequence[str]) -> dict[str, SliderMethod]:
     """Return methods by name: built-in ones, or functions as `package.module:function`.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import progdf
+from progdf.errors import ProgdfError
 from progdf.io.images import contact_sheet, to_picture
+from progdf.io.json_values import convert_json, decode_json
 from trainer.evaluate.measures import markdown_table
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
 
-from .edits import GIVEN, STRENGTHS, VERSION, KnownEdit
+from .edits import GIVEN, STRENGTHS, KnownEdit, Suite
 
 FADE = "cross-fade"
 """Reference in picture space: a cross-fade in sRGB between the true pictures of both ends."""
@@ -124,53 +127,56 @@ def summarize(results: Sequence[EditResult]) -> dict[str, dict[str, Estimate]]:
     return summary
 
 
-def summary_table(results: Sequence[EditResult], perceptual: str) -> str:
-    """Format a line per method, with 95 % intervals, as Markdown."""
-    summary = summarize(results)
+def summary_rows(results: Sequence[EditResult], perceptual: str) -> list[dict[str, str]]:
+    """Return a row per method, with 95 % intervals: heading → cell."""
     first = method_names(results)[0]
     label = "LPIPS" if perceptual.startswith("lpips") else perceptual
-    head = ("method", "PSNR, dB", f"against {first}, dB", "worst, dB", "SSIM", label, "PSNR at 1, dB")
     rows = []
-    for name, of in summary.items():
+    for name, of in summarize(results).items():
         worst = min(float(result.errors[name]["psnr"][:, 1:-1].min()) for result in results)
+        seconds = float(np.mean([result.seconds[name] for result in results]))
         rows.append(
-            (
-                name,
-                of["psnr_between"].text(1),
-                "" if name == first else of["psnr_gain"].text(1),
-                f"{worst:.1f}",
-                of["ssim_between"].text(3),
-                of["lpips_between"].text(4),
-                "exact" if name == FADE else of["psnr_end"].text(1),
-            )
+            {
+                "method": name,
+                "PSNR, dB": of["psnr_between"].text(1),
+                f"against {first}, dB": "" if name == first else of["psnr_gain"].text(1),
+                "worst, dB": f"{worst:.1f}",
+                "SSIM": of["ssim_between"].text(3),
+                label: of["lpips_between"].text(4),
+                "PSNR at 1, dB": "exact" if name == FADE else of["psnr_end"].text(1),
+                "processor s per edit": "" if name == FADE else f"{seconds:.1f}",
+            }
         )
-    return markdown_table(head, rows)
+    return rows
 
 
-def edit_table(results: Sequence[EditResult]) -> str:
-    """Format a line per edit, with each method's PSNR between the ends and at 1, as Markdown."""
-    names = method_names(results)
-    head = ("edit", "members", *(f"{name}, dB" for name in names))
+def edit_rows(results: Sequence[EditResult]) -> list[dict[str, str]]:
+    """Return a row per edit, with each method's PSNR between the ends and at 1: heading → cell."""
     rows = []
     for result in results:
-        cells = []
-        for name in names:
+        row = {"edit": result.edit.name, "scene": result.edit.scene, "members": str(result.members)}
+        for name in method_names(results):
             between = _between([result], name, "psnr")[0].mean()
             end = _at_end([result], name, "psnr")[0].mean()
-            cells.append(f"{between:.1f}" if name == FADE else f"{between:.1f} / {end:.1f}")
-        rows.append((result.edit.name, str(result.members), *cells))
-    return markdown_table(head, rows)
+            row[f"{name}, dB"] = f"{between:.1f}" if name == FADE else f"{between:.1f} / {end:.1f}"
+        rows.append(row)
+    return rows
+
+
+def format_rows(rows: Sequence[Mapping[str, str]]) -> str:
+    """Format rows of the same headings as Markdown."""
+    return markdown_table(tuple(rows[0]), [tuple(row.values()) for row in rows])
 
 
 def suite_json(
-    results: Sequence[EditResult], perceptual: str, effort: Mapping[str, int], seed: int, threads: int
+    results: Sequence[EditResult], perceptual: str, suite: Suite, seed: int, threads: int
 ) -> dict[str, Any]:
     """Return the content of sliders.json.
 
     Args:
         results: the results by edit
         perceptual: name of the perceptual distance
-        effort: views, image size and steps
+        suite: version of the suite
         seed, threads: see `EvaluateOptions`
     """
     edits = {
@@ -196,10 +202,10 @@ def suite_json(
     }
     return {
         "suite": "sliders",
-        "version": VERSION,
+        "version": suite.version,
         "seed": seed,
         "threads": threads,
-        **effort,
+        **asdict(suite.effort),
         "perceptual": perceptual,
         "given": list(GIVEN),
         "strengths": list(STRENGTHS),
@@ -207,6 +213,32 @@ def suite_json(
         "summary": summary,
         "edits": edits,
     }
+
+
+def read_results(path: Path) -> tuple[list[EditResult], dict[str, Any]]:
+    """Read a sliders.json. Return its results, without pictures, and its other entries.
+
+    Raises:
+        ProgdfError: the file is missing or damaged.
+    """
+    try:
+        content = convert_json(decode_json(path.read_bytes()), dict[str, Any])
+        edits = content.pop("edits")
+    except FileNotFoundError:
+        raise ProgdfError(f"{path} does not exist; run progdf evaluate --suite sliders first") from None
+    except (ValueError, KeyError) as error:
+        raise ProgdfError(f"{path} is damaged ({error}); run progdf evaluate --suite sliders again") from None
+    results = []
+    for name, of in edits.items():
+        errors = {
+            method: {measure: np.array(values[measure]) for measure in MEASURES}
+            for method, values in of["methods"].items()
+        }
+        seconds = {method: float(values["seconds"]) for method, values in of["methods"].items()}
+        edit = KnownEdit(name, of["scene"], (), "" if of["truth"] == "formula" else of["truth"])
+        views = tuple(of["views"])
+        results.append(EditResult(edit, of["gaussians"], of["members"], views, errors, seconds, {}))
+    return results, content
 
 
 def _round_errors(errors: Errors, measure: str) -> list[list[float]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,31 +20,22 @@ from progdf.terminal import print_line
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.options import EvaluateOptions, check_ranges
 from trainer.resolve import prepare_process
-from trainer.run.demo import Effort
 from trainer.store.run_folder import write_json
 
-from .edits import (
-    EDITS,
-    EFFORT,
-    SIZES,
-    STRENGTHS,
-    EditTask,
-    KnownEdit,
-    KnownTruth,
-    load_made_scene,
-    make_task,
-)
-from .methods import DEFAULT_METHODS, Slider, SliderMethod, find_methods
+from .edits import STRENGTHS, SUITES, EditTask, KnownEdit, KnownTruth, Suite, make_task
+from .methods import Slider, SliderMethod, find_methods
 from .results import (
     FADE,
     MEASURES,
     SHOWN_STRENGTHS,
     EditResult,
-    edit_table,
+    edit_rows,
+    format_rows,
     suite_json,
     suite_picture,
-    summary_table,
+    summary_rows,
 )
+from .scenes import load_suite_scene
 
 
 def evaluate_suite(options: EvaluateOptions) -> list[EditResult]:
@@ -54,17 +44,16 @@ def evaluate_suite(options: EvaluateOptions) -> list[EditResult]:
     Raises:
         ProgdfError: an option does not fit, a method is unknown or fails, or the folder cannot be written to.
     """
-    methods = find_methods(options.methods or DEFAULT_METHODS)
+    suite = SUITES[options.suite or "sliders"]
+    methods = find_methods(options.methods or suite.methods)
     check_ranges(("--seed", options.seed, 0, 2**32 - 1))
     perceptual, warning = perceptual_loss()
     if warning:
         print_line(warning.replace("training with", "measuring with"))
-    results = run_suite(
-        options.run, methods, perceptual, options.seed, options.threads, on_result=_print_result
-    )
+    results = run_suite(options.run, methods, perceptual, options.seed, options.threads, _print_result, suite)
     print_line("")
-    for table in (edit_table(results), summary_table(results, perceptual.name)):
-        for line in (*table.splitlines(), ""):
+    for rows in (edit_rows(results), summary_rows(results, perceptual.name)):
+        for line in (*format_rows(rows).splitlines(), ""):
             print_line(line)
     print_line(f"wrote {options.run / 'sliders.json'} and sliders.png")
     return results
@@ -77,9 +66,7 @@ def run_suite(
     seed: int = 0,
     threads: int = 0,
     on_result: Callable[[EditResult], None] = lambda result: None,
-    edits: Sequence[KnownEdit] | None = None,
-    sizes: Mapping[str, int] | None = None,
-    effort: Effort | None = None,
+    suite: Suite | None = None,
 ) -> list[EditResult]:
     """Compare methods on every edit, and write FOLDER/sliders.json and sliders.png.
 
@@ -90,7 +77,7 @@ def run_suite(
         seed: seed of the trainings
         threads: CPU threads; 0: all cores
         on_result: called after each edit
-        edits, sizes, effort: a smaller suite, for tests; None: the whole one
+        suite: version of the suite; None: the current one
 
     Raises:
         ProgdfError: a method fails, or the folder cannot be written to.
@@ -98,17 +85,16 @@ def run_suite(
     prepare_process(threads)
     make_folder(folder)
     perceptual = perceptual or perceptual_loss()[0]
-    sizes = sizes or SIZES
-    effort = effort or EFFORT
+    suite = suite or SUITES["sliders"]
     scenes: dict[str, DemoScene] = {}
     results = []
-    for edit in edits or EDITS:
+    for edit in suite.edits:
         if edit.scene not in scenes:
-            scenes[edit.scene] = load_made_scene(folder, edit.scene, sizes[edit.scene])
-        task, truth = make_task(edit, scenes[edit.scene], folder, effort, threads, seed)
+            scenes[edit.scene] = load_suite_scene(folder, edit.scene, suite.sizes.get(edit.scene, 0))
+        task, truth = make_task(edit, scenes[edit.scene], folder, suite.effort, threads, seed)
         results.append(_compare(edit, task, truth, methods, perceptual))
         on_result(results[-1])
-    write_json(folder / "sliders.json", suite_json(results, perceptual.name, asdict(effort), seed, threads))
+    write_json(folder / "sliders.json", suite_json(results, perceptual.name, suite, seed, threads))
     write_image(folder / "sliders.png", suite_picture(results))
     return results
 
