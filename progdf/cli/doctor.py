@@ -31,7 +31,10 @@ from progdf.terminal import file_size, format_count, print_line
 PACKAGE = "progdf-studio"
 
 COMPILE_LIMIT_S = 300.0
-"""Time limit of a test in seconds; the first one may compile kernels on a slow machine."""
+"""Time limit of a test that draws or trains, in seconds: the first one may compile kernels."""
+
+START_LIMIT_S = 60.0
+"""Time limit of the tests of window and card, in seconds: a display or a driver may never answer."""
 
 GAUSSIANS = 600
 """Number of Gaussians of the test scene."""
@@ -227,7 +230,7 @@ def _opengl(scene: Path) -> Finding:
 
 def _window(scene: Path) -> Finding:
     """Test a window. A machine without a display is no failure: the other commands work on it."""
-    made = _run("window-test")
+    made = _run("window-test", limit_s=START_LIMIT_S)
     if made.status == 2 and not has_display():
         return Finding("note", "window", "no display here; all commands except view work")
     return _judge("window", made, made.output.strip())
@@ -240,7 +243,7 @@ def _training(scene: Path) -> Finding:
 
 def _card(scene: Path) -> Finding:
     """Report the CUDA card that torch finds."""
-    made = _run("card-test")
+    made = _run("card-test", limit_s=START_LIMIT_S)
     return _judge("card", made, made.output.strip())
 
 

@@ -40,6 +40,14 @@ def test_a_dead_display_is_named(scene: Path, monkeypatch: pytest.MonkeyPatch) -
     assert "no window can be opened here" in finding.text
 
 
+def test_a_display_that_never_answers_is_named(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":9876")
+    monkeypatch.setattr(doctor, "START_LIMIT_S", 0.001)
+    finding = doctor._window(scene)
+    assert finding.verdict == "FAILED"
+    assert "not finished after" in finding.text
+
+
 def test_missing_drivers_fail_opengl_alone(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(scene.parent))
     assert doctor._opengl(scene).verdict == "FAILED"
