@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import ExifTags, Image, ImageDraw, ImageFont
+from PIL import ExifTags, Image, ImageDraw, ImageFont, UnidentifiedImageError
 from PIL.JpegImagePlugin import JpegImageFile, get_sampling
 from PIL.PngImagePlugin import PngImageFile
 from torch import Tensor
@@ -218,8 +218,21 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
     except ProgdfError:
         raise
     except Exception as error:  # each format's reader raises its own errors
-        reason = "it does not exist" if isinstance(error, FileNotFoundError) else type(error).__name__
+        reason = _read_failure(error)
         raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
+
+
+def _read_failure(error: Exception) -> str:
+    """Return why a picture cannot be read, as a part of a message."""
+    if isinstance(error, UnidentifiedImageError):
+        return f"it is none of {', '.join(FORMATS)}"
+    if isinstance(error, Image.DecompressionBombError):
+        return f"it has more than {MAX_PIXELS // 1_000_000} million pixels"
+    if isinstance(error, FileNotFoundError):
+        return "it does not exist"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split())[:100] or type(error).__name__
 
 
 def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 
 def npy(path: Path, header: bytes, magic: bytes = b"\x93NUMPY\x01\x00") -> Path:
     """Write a .npy file with this header and 64 bytes of numbers."""
     path.write_bytes(magic + len(header).to_bytes(2, "little") + header + b"\0" * 64)
+    return path
+
+
+def chunk(kind: bytes, content: bytes) -> bytes:
+    """Return a chunk of a .png."""
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def bomb(path: Path, width: int, height: int) -> Path:
+    """Write a PNG of a few kilobytes that claims many pixels."""
+    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
+    rows = chunk(b"IDAT", zlib.compress(b"\0" * 2_000_000, 9))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + rows + chunk(b"IEND", b""))
     return path
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import moderngl
 import numpy as np
 from imgui_bundle import imgui
-from PIL import Image
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -70,11 +69,15 @@ DecalPlace = tuple[Decal, Camera, str]
 
 
 def is_decal(path: Path) -> bool:
-    """Return True if a picture has both transparent and visible pixels."""
-    with Image.open(path) as picture:
-        if "A" not in picture.getbands() and "transparency" not in picture.info:
-            return False
-        low, high = picture.convert("RGBA").getchannel("A").getextrema()
+    """Return True if a picture has both transparent and visible pixels.
+
+    Raises:
+        ProgdfError: it cannot be read.
+    """
+    picture = open_picture(path)
+    if not picture.has_transparency_data:
+        return False
+    low, high = picture.convert("RGBA").getchannel("A").getextrema()
     return bool(isinstance(low, int) and isinstance(high, int) and low < 255 and high > 0)
 
 

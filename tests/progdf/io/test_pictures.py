@@ -23,6 +23,7 @@ from progdf.io.images import (
     read_picture,
     write_image,
 )
+from tests.helpers.hostile import bomb, chunk
 from tests.helpers.refused import refusal
 
 
@@ -83,19 +84,6 @@ def test_image_for_an_impossible_folder_is_reported_in_one_line(tmp_path: Path) 
         write_image(tmp_path / "taken" / "a.png", torch.zeros(1, 1, 3))
 
 
-def chunk(kind: bytes, content: bytes) -> bytes:
-    """Return a chunk of a .png."""
-    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-
-def bomb(path: Path, width: int, height: int) -> Path:
-    """Write a PNG of a few kilobytes that claims many pixels."""
-    header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
-    rows = chunk(b"IDAT", zlib.compress(b"\0" * 2_000_000, 9))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + rows + chunk(b"IEND", b""))
-    return path
-
-
 @pytest.mark.parametrize("size", [(13_000, 13_000), (1_000_000_000, 1), (8_200, 8_200)])
 def test_oversized_picture_is_refused_before_unpacking(size: tuple[int, int], tmp_path: Path) -> None:
     path = bomb(tmp_path / "a.png", *size)
@@ -115,7 +103,16 @@ def test_picture_of_other_proportions_is_not_unpacked(tmp_path: Path) -> None:
 def test_postscript_is_not_a_picture(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\n")
-    refusal(open_picture, path)
+    assert "it is none of PNG, JPEG" in refusal(open_picture, path)
+
+
+def test_damaged_picture_is_refused_with_its_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    Image.effect_noise((60, 60), 9.0).save(path)
+    path.write_bytes(path.read_bytes()[:900])
+    assert "image file is truncated" in refusal(open_picture, path)
+    assert "it has more than 67 million pixels" in refusal(open_picture, bomb(path, 100_000, 100_000))
+    assert "it does not exist" in refusal(open_picture, tmp_path / "b.png")
 
 
 def test_transparency_becomes_the_background(tmp_path: Path) -> None:

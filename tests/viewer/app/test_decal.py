@@ -16,6 +16,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
 from progdf.threads import StoppedError
+from tests.helpers.hostile import bomb
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
@@ -273,3 +274,10 @@ def test_picture_with_transparency_is_a_decal(tmp_path: Path, mode: str, alpha: 
     picture.putpixel((0, 0), (9, 9, 9, alpha))
     picture.convert(mode).save(tmp_path / "a.png")
     assert is_decal(tmp_path / "a.png") == expected
+
+
+def test_dropped_picture_with_too_many_pixels_is_refused(app: App, tmp_path: Path) -> None:
+    app.parts.file_actions.open(bomb(tmp_path / "a.png", 100_000, 100_000))
+    message = app.main_view.work.message
+    assert message is not None
+    assert "it has more than 67 million pixels" in message.text

@@ -282,9 +282,8 @@ class PreviewActions:
         if state == painted.state:
             return WATCH_S
         try:
-            with Image.open(painted.path) as picture:
-                pixels = np.asarray(picture.convert("RGB"))
-        except (OSError, SyntaxError, ValueError):  # not completely written yet
+            pixels = np.asarray(open_picture(painted.path).convert("RGB"))
+        except ProgdfError:  # not completely written yet
             return WATCH_S
         self._painting = replace(painted, state=state)
         height, width = pixels.shape[:2]
