@@ -33,6 +33,7 @@ SIDE = 33
 _MAX_FILE_BYTES = 80 << 20  # `MAX_SIDE`³ rows of usual length take 60 MB
 _SETTINGS_MARK = "# progdf grade: "
 _SETTINGS_BYTES = 8192  # the comment with the settings is within the first part of a file
+_NUMBER = re.compile(r"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _MAX_COLOR = 100.0  # a channel with a larger absolute value is refused
 _KEYWORD_COUNTS = {"LUT_3D_SIZE": 1, "DOMAIN_MIN": 3, "DOMAIN_MAX": 3, "LUT_3D_INPUT_RANGE": 2}
 """Number of values that follow each keyword."""
@@ -70,9 +71,11 @@ def read_cube(path: str | os.PathLike[str]) -> Tensor:
     count = int(size) ** 3
     try:
         numbers = np.loadtxt(io.StringIO(rows or "0 0 0"), ndmin=2)
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise ProgdfError(f"{name} has an invalid row ({reason:.100}); save it again") from None
+    except ValueError:
+        row = _invalid_row(rows)
+        raise ProgdfError(
+            f"{name} has an invalid row '{row:.40}', expected 3 numbers; save it again"
+        ) from None
     if numbers.shape != (count, 3):
         found = f"{numbers.shape[0]} rows of {numbers.shape[1]} numbers"
         raise ProgdfError(f"{name} holds {found}, LUT_3D_SIZE {size:g} needs {count} of 3; save it again")
@@ -84,6 +87,15 @@ def read_cube(path: str | os.PathLike[str]) -> Tensor:
         return table
     positions = ((lattice_colors(65) - min_color) / (max_color - min_color)).clamp(0.0, 1.0)
     return look_up(positions.float().T, table).T.contiguous()
+
+
+def _invalid_row(rows: str) -> str:
+    """Return the first line that is not three numbers, "" if there is none."""
+    for line in rows.splitlines():
+        values = line.partition("#")[0].split()
+        if values and not (len(values) == 3 and all(map(_NUMBER.fullmatch, values))):
+            return line.strip()
+    return ""
 
 
 def _decode(content: bytes) -> str:

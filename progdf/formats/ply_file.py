@@ -201,14 +201,17 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
     ]
     header = ["comment" if line.startswith(_COMMENT_KEYWORDS) or not line else line for line in lines]
     counts = [match for line in header if (match := _ELEMENT.fullmatch(line))]
+    for line in header:
+        if line.startswith("element ") and not _ELEMENT.fullmatch(line):
+            raise ProgdfError(
+                f"{path} has a broken header: '{line:.60}' should be a name and a count; export it again"
+            )
     empty = [_ELEMENT.sub(r"\g<1>0", line) for line in header]
     try:
         layout = PlyData.read(io.BytesIO("\n".join([*empty, "end_header", ""]).encode()))
     except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise ProgdfError(f"{path} has a broken header: {str(error)[:100]}; export it again") from None
     rows = {element.name: int(match[2]) for element, match in zip(layout, counts, strict=False)}
-    if len(rows) < len(layout.elements):
-        raise ProgdfError(f"{path} has a broken header: counts are digits; export it again")
     antialiased = next((known for known in reversed(antialiased_flags) if known is not None), False)
     texts = [line.partition(" ")[2] for line in lines if line.startswith(_COMMENT_KEYWORDS)]
     comments = tuple(re.sub(r"[^ -~]", "?", text[:_MAX_COMMENT_LENGTH]) for text in texts)

@@ -140,7 +140,12 @@ BROKEN = {
     "more": (f"LUT_3D_SIZE 2\n{ROWS}0 0 0\n", "holds 9 rows of 3 numbers, LUT_3D_SIZE 2 needs 8 of 3"),
     "no rows": ("LUT_3D_SIZE 2\n", "needs 8 of 3"),
     "four": ("LUT_3D_SIZE 2\n" + "0 0 0 1\n" * 8, "holds 8 rows of 4"),
-    "words": (f"LUT_3D_SIZE 2\n{ROWS[:20]}{'x' * 9999} 0 0\n{ROWS[20:]}", "has an invalid row"),
+    "words": (
+        f"LUT_3D_SIZE 2\n{ROWS[:20]}{'x' * 9999} 0 0\n{ROWS[20:]}",
+        "has an invalid row '.*', expected 3",
+    ),
+    "two": (f"LUT_3D_SIZE 2\n0 0\n{ROWS[6:]}", "has an invalid row '0 0', expected 3 numbers"),
+    "a word": (f"LUT_3D_SIZE 2\n0 0 nan0\n{ROWS[6:]}", "has an invalid row '0 0 nan0', expected 3 numbers"),
     "nan": (f"LUT_3D_SIZE 2\n0 0 nan\n{ROWS[12:]}", "a color that is not finite or beyond"),
     "inf": (f"LUT_3D_SIZE 2\n0 0 -inf\n{ROWS[12:]}", "a color that is not finite or beyond"),
     "domain": (f"LUT_3D_SIZE 2\nDOMAIN_MAX 1 0 1\n{ROWS}", "which is empty"),

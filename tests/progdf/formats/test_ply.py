@@ -211,7 +211,8 @@ def test_other_file_kinds_are_named(tmp_path: Path) -> None:
         (b"ply\nend_header\n", "format"),
         (b"ply\nformat ascii 1.0\nend_header\n", "vertex"),
         (b"ply\nformat ascii 2.0\nend_header\n", "line 2: expected version"),
-        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "broken header"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "'element vertex -1' should be"),
+        (b"ply\nformat ascii 1.0\nelement vertex %d\nend_header\n" % 10**30, "should be a name and a count"),
         (
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty int x\nend_header\n",
             "same name",
