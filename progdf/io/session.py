@@ -186,9 +186,8 @@ def verify_files(path: Path, session: SessionFile) -> tuple[tuple[Path, ...], tu
         if not os.path.isfile(file) and os.path.isfile(beside):
             file = beside
         if not os.path.isfile(file):  # Path.is_file raises for a name that is too long
-            raise ProgdfError(
-                f"{path.name} needs {file}, which does not exist; put it back, or beside the session"
-            )
+            state = "is not a regular file" if os.path.exists(file) else "does not exist"
+            raise ProgdfError(f"{path.name} needs {file}, which {state}; put it back, or beside the session")
         if sha256(file) != ref.sha256.lower():
             raise ProgdfError(
                 f"{path.name} was saved with another version of {file.name} than {file}; "

@@ -124,6 +124,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("scene",), "bear.ply", "scene"),
     (("scene", "file"), "gone.ply", "does not exist"),
     (("scene", "file"), "g" * 5000, "does not exist"),
+    (("scene", "file"), ".", "is not a regular file"),
     (("scene", "file"), "", "scene"),
     (("scene", "file"), "a\0b", "scene"),
     (("scene", "sha256"), "0" * 64, "another version of bear.ply"),
