@@ -4,20 +4,15 @@ A Gaussian belongs to the kind of stroke that a random walk from it is more like
 Random Walks for Image Segmentation, 2006). Steps to near neighbors of like color are more probable. Distances
 and color differences are measured in units of their medians between neighbors. (Scales chosen by
 cross-validation over strokes are no better: docs/lab/experiments.md, Regions from strokes.)
-
-The probabilities solve a linear system with one unknown per Gaussian, by conjugate gradients. The
-preconditioner is one multigrid cycle over groups of neighbors (Notay, An Aggregation-Based Algebraic
-Multigrid Method, 2010).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
-from progdf.rasterize.cpu.jit import Number, kernel
+from progdf.surface.graph_solver import GraphSolver
 
 from .point_tree import PointTree
 from .selection import Floats, Mask, Surface
@@ -31,14 +26,7 @@ _MIN_STEP_WEIGHT = (
 )
 _STROKE_WEIGHT = 1e3  # weight that fixes a stroked Gaussian, in sums of its steps' weights
 _OUTSIDE_WEIGHT = 1e-6  # weight that pulls every Gaussian outside; decides those connected with no stroke
-_RESIDUAL_SHARE = 1e-3  # share of the initial residual; smaller residuals change no selection
-_MIN_COARSENED_ROWS = (
-    500  # rows; smaller levels are not coarsened, and up to four times as many are solved directly
-)
-_MAX_COARSENING_RATIO = 0.7  # coarsening stops if a level keeps more than this share of the rows
-_JACOBI_DAMPING = 0.7  # damping of Jacobi smoothing
-_OVERCORRECTION = 1.6  # scale of a coarse correction, which is too small by this factor (Braess, 1995)
-_MAX_STEPS = 200  # conjugate gradient steps per level
+_ACCURACY = 1e-3  # see `GraphSolver.solve`; smaller errors change no selection
 
 
 class Scribbles:
@@ -50,7 +38,7 @@ class Scribbles:
     """
 
     def __init__(self, points: NDArray[np.floating], colors: Floats) -> None:
-        self._levels = _Multigrid(likely_steps(points, colors))
+        self._solver = GraphSolver(likely_steps(points, colors))
         self._count = len(points)
 
     def select(self, inside: Rows, outside: Rows) -> Mask:
@@ -73,7 +61,10 @@ class Scribbles:
         beside &= ~both
         if not on.any() or self._count == 1:
             return on
-        return self._levels.chances(on, beside) > 0.5
+        steps = self._solver.sums
+        anchors = (_STROKE_WEIGHT * (on | beside) + _OUTSIDE_WEIGHT).astype(np.float32) * steps
+        chances = self._solver.solve(anchors, np.float32(_STROKE_WEIGHT) * on * steps, _ACCURACY)
+        return chances > 0.5
 
 
 def rows_under(painted: Mask, seen: Surface) -> Rows:
@@ -109,140 +100,3 @@ def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
     steps = csr_array((weights.astype(np.float32).ravel(), near.ravel(), start), shape=(count, count))
     both: csr_array = (steps + steps.T).tocsr()
     return both
-
-
-class _Multigrid:
-    """Hierarchy of graphs; each level groups the nodes of the finer one."""
-
-    def __init__(self, weights: csr_array) -> None:
-        self._weights = [weights]
-        self._groups: list[NDArray[np.int32]] = []
-        while len(self._groups) < 20 and self._weights[-1].shape[0] > _MIN_COARSENED_ROWS:
-            coarse, groups = _coarsen(*_coarsen(self._weights[-1], None))
-            if coarse.shape[0] > _MAX_COARSENING_RATIO * self._weights[-1].shape[0]:
-                break
-            self._weights.append(coarse)
-            self._groups.append(groups)
-        self._steps = [np.asarray(level.sum(axis=1), np.float32).ravel() for level in self._weights]
-
-    def chances(self, on: Mask, beside: Mask) -> Floats:
-        """Return the probability that a walk from each node ends on the object, 0 to 1. [N]
-
-        The solution of each coarse level starts the next finer one.
-        """
-        anchors: Floats = (_STROKE_WEIGHT * (on | beside) + _OUTSIDE_WEIGHT).astype(np.float32) * self._steps[
-            0
-        ]
-        target: Floats = np.float32(_STROKE_WEIGHT) * on * self._steps[0]
-        targets = [target]
-        self._diagonals = [self._steps[0] + anchors]
-        for level in range(len(self._groups)):
-            anchors = self._gather(level, anchors)
-            target = self._gather(level, target)
-            self._diagonals.append(self._steps[level + 1] + anchors)
-            targets.append(target)
-        coarsest = self._weights[-1]
-        is_small = coarsest.shape[0] <= 4 * _MIN_COARSENED_ROWS
-        self._factors = None
-        if is_small:
-            self._factors = cho_factor(np.diag(self._diagonals[-1].astype(np.float64)) - coarsest.toarray())
-        x = np.zeros(coarsest.shape[0], np.float32)
-        for level in reversed(range(len(targets))):
-            x = self._solve(
-                level, targets[level], x if level == len(self._groups) else x[self._groups[level]]
-            )
-        return x
-
-    def _solve(self, level: int, target: Floats, x: Floats) -> Floats:
-        """Solve a level by preconditioned conjugate gradients from the start value x. [N]"""
-        spread = np.sqrt(self._diagonals[level])
-        jacobi_guess = target / self._diagonals[level]
-        min_residual = _RESIDUAL_SHARE * float(
-            np.linalg.norm((target - self._apply(level, jacobi_guess)) / spread)
-        )
-        residual: Floats = target - self._apply(level, x)
-        direction = np.zeros_like(x)
-        before = np.inf
-        for _ in range(_MAX_STEPS):
-            if float(np.linalg.norm(residual / spread)) <= min_residual:
-                break
-            correction = self._cycle(level, residual)
-            along = float(residual @ correction)
-            direction = correction + np.float32(along / before) * direction
-            image = self._apply(level, direction)
-            step = np.float32(along / max(float(direction @ image), 1e-30))
-            x = x + step * direction
-            residual -= step * image
-            before = along
-        return x
-
-    def _gather(self, level: int, values: Floats) -> Floats:
-        count = self._weights[level + 1].shape[0]
-        sums: Floats = np.bincount(self._groups[level], values, minlength=count).astype(np.float32)
-        return sums
-
-    def _apply(self, level: int, x: Floats) -> Floats:
-        product: Floats = self._diagonals[level] * x - self._weights[level] @ x
-        return product
-
-    def _cycle(self, level: int, residual: Floats) -> Floats:
-        """Return the correction of a residual by one multigrid cycle. [N]"""
-        damped = np.float32(_JACOBI_DAMPING) / self._diagonals[level]
-        if level == len(self._groups):
-            if self._factors is None:
-                return damped * residual
-            solved: Floats = cho_solve(self._factors, residual).astype(np.float32)
-            return solved
-        x = damped * residual
-        coarse = self._cycle(level + 1, self._gather(level, residual - self._apply(level, x)))
-        x += np.float32(_OVERCORRECTION) * coarse[self._groups[level]]
-        return x + damped * (residual - self._apply(level, x))
-
-
-def _coarsen(weights: csr_array, groups: NDArray[np.int32] | None) -> tuple[csr_array, NDArray[np.int32]]:
-    """Return the graph of pairs of strongly connected nodes, and the index of each node's pair.
-
-    `groups` holds the node of `weights` for each node of a finer graph, whose pairs are then returned
-    instead.
-    """
-    pairs, count = _pair(weights.indptr, weights.indices, weights.data)
-    edges = weights.tocoo()
-    row = pairs[edges.row]
-    col = pairs[edges.col]
-    across = row != col
-    coarse = coo_array((edges.data[across], (row[across], col[across])), shape=(count, count)).tocsr()
-    return coarse, pairs if groups is None else pairs[groups]
-
-
-@kernel(cache=True, allocates=True)
-def _pair(start: Number, neighbors: Number, weights: Number) -> Number:
-    """Pair each node with its most likely free neighbor; return each pair index [N] int32 and the count."""
-    count = len(start) - 1
-    groups = np.full(count, -1, np.int32)
-    used = 0
-    for node in range(count):
-        if groups[node] >= 0:
-            continue
-        free = -1
-        likely = np.float32(0.0)
-        other = -1
-        other_likely = np.float32(0.0)
-        for at in range(start[node], start[node + 1]):
-            near = neighbors[at]
-            if near == node:
-                continue
-            if groups[near] < 0:
-                if weights[at] > likely:
-                    free = near
-                    likely = weights[at]
-            elif weights[at] > other_likely:
-                other = near
-                other_likely = weights[at]
-        if free < 0 and other >= 0:
-            groups[node] = groups[other]
-            continue
-        groups[node] = used
-        if free >= 0:
-            groups[free] = used
-        used += 1
-    return groups, used

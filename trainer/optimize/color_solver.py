@@ -384,8 +384,7 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     """
     ones = original.new_ones(len(original), 3)
     device = original.device
-    # few views cannot tell the directions of a residual apart, see `choose_model`
-    bands = 1 if ties is not None else min(BANDS[-1], views[0].members.sh.shape[1])
+    bands = min(BANDS[-1], views[0].members.sh.shape[1]) if ties is None else 1  # see `choose_model`
     weights = original.new_zeros(len(original), bands, bands, dtype=torch.float32)
     weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
