@@ -20,34 +20,44 @@ PAGES = {
 GALLERY = ROOT / "build" / "gallery"
 """Exported pages, made by `docs/site/gallery.py`."""
 
+STYLE = "assets/site.css"
+"""Name of `site.css` in the site."""
+
 _CODE_LINK = re.compile(r"\[([^\]\[]*)\]\([^)]+\.(?:py|ipynb)\)|\[([^\]\[]*)\]\(LICENSE\)")
+_COMMANDS = re.compile(r"^```\n(?=(?:progdf|make|python3?|pip|\.venv/bin/\w+) )", re.MULTILINE)
 _EXHIBIT = re.compile(r"!\[[^\]]*\]\(\.\./assets/exhibits/([\w-]+)\.jpg\)")
 _LINK = re.compile(r"(\]\(|src=\"|href=\")([^)\"#\s]+)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages of the repository, the pictures of assets/ and the gallery to those of docs/."""
+    """Add the pages of the repository, the pictures and scenes of assets/ and the gallery to those of docs/."""
     from mkdocs.structure.files import File  # of the extra `docs`
 
     for source, name in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, name, content=text))
-    for picture in sorted((ROOT / "assets").rglob("*")):
-        if picture.suffix in (".png", ".jpg", ".webp", ".svg"):
-            name = picture.relative_to(ROOT).as_posix()
-            files.append(File.generated(config, name, abs_src_path=str(picture)))
+    pictures = {path for kind in ("png", "jpg", "webp", "svg") for path in (ROOT / "assets").rglob(f"*.{kind}")}
+    scenes = {path for path in (ROOT / "assets" / "scenes").iterdir() if path.suffix != ".md"}
+    for path in sorted(pictures | scenes):
+        files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
+    files.append(File.generated(config, STYLE, abs_src_path=str(ROOT / "docs" / "site" / "site.css")))
     for made in sorted(GALLERY.glob("*.html")):
         files.append(File.generated(config, f"gallery/{made.name}", abs_src_path=str(made)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    """Lead links of the repository to pages of the site, unlink those to code, and link exhibits."""
+    """Lead links of the repository to pages of the site, unlink those to code, and link exhibits.
+
+    Blocks of commands become `bash`, which wraps and colors them.
+    """
     source = page.file.src_uri
     if source == "gallery.md":
-        markdown = _EXHIBIT.sub(r"[\g<0>](gallery/\1.html)", markdown)
-    folder = "" if source in PAGES.values() else "docs/"
-    folder += source.rpartition("/")[0]
+        opener = "[Open the live sliders](gallery/\\1.html){ .md-button }"
+        markdown = _EXHIBIT.sub(rf"[\g<0>](gallery/\1.html)\n\n{opener}", markdown)
+    written = {name: path for path, name in PAGES.items()}.get(source, f"docs/{source}")
+    folder = written.rpartition("/")[0]
+    markdown = _COMMANDS.sub("```bash\n", markdown)
 
     def convert(match: re.Match[str]) -> str:
         before, target = match.groups()
