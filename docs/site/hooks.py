@@ -49,7 +49,7 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Lead links of the repository to pages of the site, unlink those to code, and link exhibits.
 
-    Blocks of commands become `bash`, which wraps and colors them.
+    Blocks of commands get the class `commands`, which wraps them.
     """
     source = page.file.src_uri
     if source == "gallery.md":
@@ -57,7 +57,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         markdown = _EXHIBIT.sub(rf"[\g<0>](gallery/\1.html)\n\n{opener}", markdown)
     written = {name: path for path, name in PAGES.items()}.get(source, f"docs/{source}")
     folder = written.rpartition("/")[0]
-    markdown = _COMMANDS.sub("```bash\n", markdown)
+    markdown = _COMMANDS.sub("``` { .text .commands }\n", markdown)
 
     def convert(match: re.Match[str]) -> str:
         before, target = match.groups()

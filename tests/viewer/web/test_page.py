@@ -436,6 +436,68 @@ def test_two_fingers_pan_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Pa
     assert (panel["x"], panel["width"]) == (0, 300), "along the lower edge"
 
 
+SHARES = """
+window.shares = [];
+window.onprogdf = (page) => {
+  const draw = page.renderer.draw.bind(page.renderer);
+  page.renderer.draw = (at, background, share) => { shares.push(share); draw(at, background, share); };
+};
+Object.defineProperty(window, 'progdf', {
+  set(page) { this.shown = page; if (page) onprogdf(page); }, get() { return this.shown; },
+});
+"""
+"""Script that records the share of the width and height of each frame."""
+
+
+def test_first_picture_has_few_pixels_and_the_still_stays_until_the_sharp_one(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    opened = ready(open_page(bear_page[0], SHARES))
+    marks = opened.tab.evaluate("performance.getEntriesByType('mark').map((mark) => mark.name)")
+    assert marks == ["first picture", "sharp picture"]
+    assert opened.tab.evaluate("shares") == [0.25, 1]
+    sharp = opened.picture()
+    still = opened.tab.evaluate(
+        "(({ left, top, height }) => [left, top, height].map(parseFloat))(document.getElementById('still').style)"
+    )
+    panel = opened.tab.locator("#panel").bounding_box()
+    side = min(panel["x"], SIZE[1])
+    assert still == pytest.approx([panel["x"] / 2, SIZE[1] / 2, side], abs=1.0)
+    source = opened.tab.evaluate("document.getElementById('still').src").split(",")[1]
+    drawn = Image.open(io.BytesIO(base64.b64decode(source))).convert("RGB")
+    scale = side / drawn.height * PIXELS[0] / SIZE[0]
+    small = drawn.resize((round(drawn.width * scale), round(drawn.height * scale)), Image.Resampling.BOX)
+    left = round(still[0] * PIXELS[0] / SIZE[0]) - small.width // 2
+    top = round(still[1] * PIXELS[1] / SIZE[1]) - small.height // 2
+    width = round(panel["x"] * PIXELS[0] / SIZE[0])
+    overlap = np.asarray(small)[:, -min(left, 0) : width - left]
+    shown = sharp[top : top + small.height, max(left, 0) : width][:, : overlap.shape[1]]
+    assert psnr(shown, overlap) > 22.0, "the picture does not jump"
+
+
+@pytest.mark.parametrize(
+    ("sharp_ms", "coarse", "share"),
+    [
+        (20, "{share: 0.25, ms: 15}", 1),
+        (400, "{share: 0.25, ms: 40}", 0.25),
+        (4000, "{share: 0.125, ms: 65}", 0.125),
+        (400, "{share: 0.25, ms: 390}", 1),
+    ],
+)
+def test_frames_in_motion_have_as_many_pixels_as_the_device_draws_in_time(
+    open_page: Any, bear_page: tuple[Path, Stack], sharp_ms: int, coarse: str, share: float
+) -> None:
+    """The last case is limited by the number of Gaussians, which fewer pixels do not reduce."""
+    opened = ready(open_page(bear_page[0], SHARES))
+    opened.tab.evaluate(
+        f"shares.length = 0; progdf.times = {{sharp: {sharp_ms}, coarse: {coarse}}};"
+        "progdf.look({...progdf.camera, azimuth: progdf.camera.azimuth + 1})"
+    )
+    opened.wait("shares.length > 0")
+    assert opened.tab.evaluate("shares[0]") == share
+    opened.wait("shares.at(-1) === 1")
+
+
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
 
 

@@ -10,7 +10,10 @@ import { Sorter } from "./sort.js";
 import { mixCameras, restore, stateAt, visibleLayers } from "./state.js";
 
 const MOST_PIXELS = 4e6;
-const SLOW_MS = 45;  // slower frames in motion are drawn at half the width and height
+const SLOW_MS = 45;  // slower frames in motion are drawn with fewer pixels
+const SHARES = [1, 0.5, 0.25, 0.125];  // of the width and height, in motion
+const FIRST_SHARE = 0.25;  // of the first picture, when the speed of the device is unknown
+const POLL_MS = 8;
 const REST_MS = 180;
 const GLIDE_MS = 250;
 
@@ -30,7 +33,7 @@ class Page {
     this.paints = header.paints.map(container.real, container);  // a closure would keep the container in memory
     this.sorter = new Sorter(this.means, header.near, (order, seen) => {
       this.renderer.setOrder(order, seen);
-      this.request();
+      if (!this.sorting) this.request();
     });
     this.view = { layers: header.layers, groups: header.groups, blend: header.blend };
     this.home = this.camera = header.camera;
@@ -42,7 +45,7 @@ class Page {
     this.frame = 0;
     this.playing = false;
     this.comparing = false;
-    this.coarse = false;
+    this.times = { sharp: undefined, coarse: undefined };  // ms of the last frame at share 1, { share, ms } of another
     this.update = buildPanel(this.get("controls"), this);
     this.#bind();
     const touch = matchMedia("(pointer: coarse)").matches;
@@ -52,6 +55,8 @@ class Page {
     root.classList.add("ready");
     this.resize();
     this.change(this.view);
+    this.movedAt = undefined;
+    this.used = false;  // whether the view or the camera has changed
   }
 
   // Sets another view.
@@ -59,6 +64,8 @@ class Page {
     this.view = view;
     this.chosen = chosen;
     this.dirty = true;
+    this.used = true;
+    this.movedAt = performance.now();
     this.update();
     this.request();
   }
@@ -68,6 +75,7 @@ class Page {
     this.camera = camera;
     this.movedAt = performance.now();
     this.turned = true;
+    this.used = true;
     this.request();
   }
 
@@ -99,6 +107,7 @@ class Page {
     if (on === this.comparing) return;
     this.comparing = on;
     this.get("compare").setAttribute("aria-pressed", on);
+    this.movedAt = performance.now();
     this.dirty = true;
     this.request();
   }
@@ -131,6 +140,7 @@ class Page {
     const ratio = Math.min(devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
     this.canvas.width = Math.max(1, Math.round(width * ratio));
     this.canvas.height = Math.max(1, Math.round(height * ratio));
+    this.#alignStill();
     this.request();
   }
 
@@ -143,8 +153,16 @@ class Page {
 
   // Returns the picture as a data URL of a PNG.
   picture() {
-    this.#draw(performance.now());
+    this.#draw(performance.now(), 1);
     return this.canvas.toDataURL();
+  }
+
+  // Puts the still where the first picture will be.
+  #alignStill() {
+    const [focal, , cx, cy] = this.#pinhole().intrinsics, pixels = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
+    const height = (2 * focal * Math.tan((this.camera.fov_y * Math.PI) / 360)) / pixels;
+    const { style } = this.get("still");
+    Object.assign(style, { left: `${cx / pixels}px`, top: `${cy / pixels}px`, height: `${height}px` });
   }
 
   #film(playing) {
@@ -167,9 +185,14 @@ class Page {
     return pinhole(this.camera, canvas.width, canvas.height, free);
   }
 
-  #draw(now) {
+  // Draws a frame, at a share of its width and height that the device draws in time if none is given.
+  #draw(now, share = null) {
     if (!this.canvas.clientWidth) {  // hidden, for example while a notebook changes its theme
       this.resting = setTimeout(() => this.request(), REST_MS);
+      return;
+    }
+    if (share === null && this.drawing) {
+      this.again = true;
       return;
     }
     this.#advance(now);
@@ -178,21 +201,56 @@ class Page {
     if (this.turned || this.sorted?.some((x, i) => x !== row[i]) !== false) {
       this.sorted = row;
       this.turned = false;
+      this.sorting = true;
       this.sorter.sort(row);
+      this.sorting = false;
     }
+    if (!this.renderer.ordered) return;
     const moving = now - (this.movedAt ?? -Infinity) < REST_MS;
     if (moving) {
-      const took = now - (this.drawnAt ?? now);
-      if (took > 0 && took < 1000) this.pace = 0.7 * (this.pace ?? 16) + 0.3 * took;
-      this.coarse ||= this.pace > SLOW_MS;
       clearTimeout(this.resting);
       this.resting = setTimeout(() => this.request(), REST_MS + 20);
-    } else this.pace = undefined;
-    this.coarse &&= moving;
-    this.renderer.draw(at, this.header.background, this.coarse ? 0.5 : 1);
-    this.drawnAt = now;
-    this.root.classList.add("drawn");
+    }
+    const drawn = share ?? this.#share(moving);
+    this.renderer.draw(at, this.header.background, drawn);
+    if (share === null) this.#watch(drawn);
     this.shown?.();
+  }
+
+  // Returns the share of the width and height at which a frame in motion takes at most SLOW_MS. Pixels take at most as
+  // long as the rest where the rest takes longer.
+  #share(moving) {
+    const { sharp, coarse } = this.times;
+    if (!moving && (coarse || sharp !== undefined)) return 1;
+    if (sharp === undefined) return FIRST_SHARE;
+    const pixels = coarse ? Math.max(sharp - coarse.ms, 0) / (1 - coarse.share ** 2) : sharp, rest = sharp - pixels;
+    const room = Math.max(SLOW_MS - rest, rest);
+    return SHARES.find((share) => share ** 2 * pixels <= room) ?? SHARES.at(-1);
+  }
+
+  // Waits until a frame is finished.
+  #watch(share) {
+    const { gl } = this.renderer, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), start = performance.now();
+    const look = () => {
+      if (this.gone.signal.aborted || gl.isContextLost()) return;
+      if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return void setTimeout(look, POLL_MS);
+      gl.deleteSync(fence);
+      this.drawing = false;
+      this.#finish(share, performance.now() - start);
+    };
+    this.drawing = true;
+    gl.flush();
+    setTimeout(look);
+  }
+
+  #finish(share, ms) {
+    const first = this.times.sharp === undefined;
+    if (share === 1) this.times.sharp = ms;
+    else this.times.coarse = { share, ms };
+    if (first) performance.mark(share === 1 ? "sharp picture" : "first picture");
+    if (share === 1 || this.used) this.root.classList.add("drawn");  // the still is sharp until then
+    if (this.again || this.times.sharp === undefined) this.request();
+    this.again = false;
   }
 
   #advance(now) {
