@@ -2,9 +2,9 @@
 
 usage: python docs/site/first_picture.py FOLDER [--runs 5]
 
-Prints a row per page, in seconds from the start of the navigation: the still, the first live picture, which has few
-pixels, and the sharp picture; and the processor time of all processes of the browser until the first live picture,
-which other programs do not change much. Each is the least of several runs.
+Prints a row per page, in seconds from the start of the navigation: the still, the first live picture, which
+has few pixels, and the sharp picture; and the processor time of all processes of the browser until the first
+live picture, which other programs do not change much. Each is the least of several runs.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def _processor_seconds(processes: Any) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--runs", type=int, default=5)
     options = parser.parse_args()
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
-    print("| page | MB | still, s | first picture, s | sharp, s | processor time until the first picture, s |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    heads = ["page", "MB", "still, s", "first, s", "sharp, s", "processor time until the first, s"]
+    print(f"| {' | '.join(heads)} |\n{'| --- ' * len(heads)}|")
     with sync_playwright() as started:
         browser = started.chromium.launch(executable_path=chromium, args=SOFTWARE)
         for page in sorted(options.folder.glob("*.html")):

@@ -30,14 +30,15 @@ _LINK = re.compile(r"(\]\(|src=\"|href=\")([^)\"#\s]+)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages of the repository, the pictures and scenes of assets/ and the gallery to those of docs/."""
+    """Add pages of the repository, pictures and scenes of assets/, the gallery and the style sheet."""
     from mkdocs.structure.files import File  # of the extra `docs`
 
     for source, name in PAGES.items():
         text = (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, name, content=text))
-    pictures = {path for kind in ("png", "jpg", "webp", "svg") for path in (ROOT / "assets").rglob(f"*.{kind}")}
-    scenes = {path for path in (ROOT / "assets" / "scenes").iterdir() if path.suffix != ".md"}
+    assets = ROOT / "assets"
+    pictures = {path for path in assets.rglob("*") if path.suffix in (".png", ".jpg", ".webp", ".svg")}
+    scenes = {path for path in (assets / "scenes").iterdir() if path.suffix != ".md"}
     for path in sorted(pictures | scenes):
         files.append(File.generated(config, path.relative_to(ROOT).as_posix(), abs_src_path=str(path)))
     files.append(File.generated(config, STYLE, abs_src_path=str(ROOT / "docs" / "site" / "site.css")))

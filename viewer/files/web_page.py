@@ -30,8 +30,8 @@ from .document import Document
 from .session import WindowSession
 
 PAGE = ".html"  # suffix of a page
-STILL = 1200, 800
-"""Width and height of a page's still image, px."""
+STILL = 1680, 800
+"""Width and height of a page's still image, px. It fills a screen of 16:9, centered beside the panel."""
 _EXACT_DB = 99.0  # PSNR from which the error is not reported
 
 

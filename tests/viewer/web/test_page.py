@@ -458,7 +458,7 @@ def test_first_picture_has_few_pixels_and_the_still_stays_until_the_sharp_one(
     assert opened.tab.evaluate("shares") == [0.25, 1]
     sharp = opened.picture()
     still = opened.tab.evaluate(
-        "(({ left, top, height }) => [left, top, height].map(parseFloat))(document.getElementById('still').style)"
+        "[document.getElementById('still').style].flatMap((s) => [s.left, s.top, s.height]).map(parseFloat)"
     )
     panel = opened.tab.locator("#panel").bounding_box()
     side = min(panel["x"], SIZE[1])
@@ -506,7 +506,7 @@ def test_page_without_webgl_shows_a_still_and_a_message(
 ) -> None:
     opened = open_page(bear_page[0], NO_WEBGL)
     opened.wait("document.getElementById('notice').textContent.includes('WebGL2')")
-    assert opened.tab.evaluate("document.getElementById('still').naturalWidth") == 1200
+    assert opened.tab.evaluate("document.getElementById('still').naturalWidth") == 1680
     assert opened.tab.locator("#still").is_visible()
     assert not opened.tab.locator("#controls").is_visible()
     assert opened.complaints == []
