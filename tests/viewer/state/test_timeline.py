@@ -133,6 +133,21 @@ def test_camera_turns_along_one_arc_between_any_two_up_axes(
         assert found == cameras[frame // 20]
 
 
+def test_camera_turns_evenly_between_up_axes() -> None:
+    here = ViewCamera(up=(1, 0, 0), azimuth=109.0, elevation=-8.0)
+    there = ViewCamera(up=(0.6, 0.8, 0.0), azimuth=80.0, elevation=-60.0)
+    keys = [(0, "linear", here), (20, "linear", there)]
+
+    def turned(frame: int) -> float:
+        """Return the angle from the first camera, degrees."""
+        first = axes(here)
+        picture = axes(views.camera_between(keys, frame))
+        trace = sum(dot(getattr(first, name), getattr(picture, name)) for name in ("right", "up", "back"))
+        return math.degrees(math.acos(min(1.0, (trace - 1.0) / 2.0)))
+
+    assert [turned(frame) for frame in (5, 10, 15)] == pytest.approx([6.58, 13.16, 19.74], abs=0.01)
+
+
 def test_values_are_constant_before_the_first_and_after_the_last_key() -> None:
     film = timeline.set_length(shift(two_keys(), 0, 5), 40)
     assert timeline.state_at(film, 0, view()).layers == timeline.state_at(film, 5, view()).layers
