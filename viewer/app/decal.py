@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import moderngl
 import numpy as np
 from imgui_bundle import imgui
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io.images import open_picture
 from progdf.surface.footprint import DepthPicture, fit_footprint
 from viewer.camera.decal_warp import (
     DecalFrame,
@@ -36,7 +33,6 @@ from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import accent_button, checkbox, plate, small, tip
 
-_MAX_TEXTURE_PX = 1024  # maximum longer side of the picture shown on screen, pixels
 _INITIAL_SIZE = 0.25  # initial longer side, as a fraction of the view's height
 _STEP = 1.08  # size factor per notch of the wheel
 _TURN_DEG = 5.0  # rotation per notch of the wheel
@@ -53,7 +49,6 @@ _STEPS = {
 }
 """Key → size factor and turn."""
 _SIZE_RANGE_PX = (8.0, 8192.0)  # minimum and maximum, window pixels
-_MIN_ALPHA = 0.05  # smallest alpha that counts as painted
 _GHOST_ALPHA = 0.9  # opacity of a decal that is not trained yet
 _OFF_SURFACE_ALPHA = 0.35  # opacity where there is no surface
 _GRIP_PX = 5.0  # half the side of a handle, at 1×
@@ -66,57 +61,6 @@ _KNOB_PX = 26.0  # distance of the knob that rotates from the upper side, at 1×
 
 DecalPlace = tuple[Decal, Camera, str]
 """Decal, the camera that projects it, and the value of `progdf train --at`."""
-
-
-def is_decal(path: Path) -> bool:
-    """Return True if a picture has both transparent and visible pixels.
-
-    Raises:
-        ProgdfError: it cannot be read.
-    """
-    picture = open_picture(path)
-    if not picture.has_transparency_data:
-        return False
-    low, high = picture.convert("RGBA").getchannel("A").getextrema()
-    return bool(isinstance(low, int) and isinstance(high, int) and low < 255 and high > 0)
-
-
-class DecalTextures:
-    """GL textures of the pictures of decals.
-
-    Args:
-        context: the GL context of the textures
-    """
-
-    def __init__(self, context: moderngl.Context) -> None:
-        self._context = context
-        self._textures: dict[int, moderngl.Texture] = {}  # by GL name
-
-    def __len__(self) -> int:
-        return len(self._textures)
-
-    def load(self, path: Path) -> Decal:
-        """Load a picture as a decal.
-
-        Raises:
-            ProgdfError: it cannot be read.
-        """
-        picture = open_picture(path).convert("RGBA")
-        picture.thumbnail((_MAX_TEXTURE_PX, _MAX_TEXTURE_PX))
-        pixels = np.asarray(picture)
-        texture = self._context.texture(picture.size, 4, pixels.tobytes(), alignment=1)
-        texture.build_mipmaps()
-        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self._textures[int(texture.glo)] = texture
-        return Decal(path, int(texture.glo), picture.size, pixels[..., 3] > 255 * _MIN_ALPHA)
-
-    def keep(self, transient: Transient) -> None:
-        """Free the textures of decals that are neither being placed nor in training."""
-        used = {ghost.texture for ghost in transient.ghosts if isinstance(ghost, DecalGhost)}
-        if isinstance(transient.gizmo, Decal):
-            used.add(transient.gizmo.texture)
-        for name in self._textures.keys() - used:
-            self._textures.pop(name).release()
 
 
 def frame_delays(decal: object, is_busy: bool, now: float) -> list[float]:

@@ -16,7 +16,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
-from viewer.app.decal import DecalTextures
+from viewer.app.parts.pictures import DecalTextures
 from viewer.state.commands import Plain
 from viewer.state.forms import with_settings
 from viewer.state.workspace import start_tour, with_question, with_transient

@@ -22,7 +22,8 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from trainer.editors.decal import parse_place
 from viewer.app.app import App
-from viewer.app.decal import DecalTextures, decal_corners, is_decal, outline
+from viewer.app.decal import decal_corners, outline
+from viewer.app.parts.pictures import DecalTextures, is_decal
 from viewer.jobs.training import EditOrder
 from viewer.render.decal_surfaces import DecalSurfaces
 from viewer.state.commands import Plain

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.app.decal import DecalTextures
+from viewer.app.parts.pictures import DecalTextures
 from viewer.state.commands import Plain
 from viewer.state.transient import Decal
 from viewer.state.view_state import SelectTool

@@ -7,11 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import moderngl
+import numpy as np
 
 from progdf.camera import Camera
 from progdf.compose.picture_layers import find_layer_files
 from progdf.errors import ProgdfError
 from progdf.io.cameras import camera_search_folder, load_cameras
+from progdf.io.images import open_picture
 from progdf.io.picture_camera import (
     PictureLayers,
     camera_file,
@@ -21,7 +23,6 @@ from progdf.io.picture_camera import (
 )
 from progdf.scene.match_views import view_thumbnail
 from progdf.scene.taken_views import FoundView, TakenView, find_view, remember_view, taken_views
-from viewer.app.decal import DecalTextures, is_decal
 from viewer.app.inspect.frusta import viewpoints
 from viewer.app.messages import Messages, Requests, WaitFor
 from viewer.camera.view_camera import ViewCamera, from_camera, to_camera
@@ -29,8 +30,63 @@ from viewer.files import exports
 from viewer.files.document import DocumentStore
 from viewer.pictures.film import Pixels
 from viewer.state.forms import with_picture
+from viewer.state.transient import Decal, DecalGhost, Transient
 from viewer.state.workspace import Dialog, Store, with_camera, with_transient
 from viewer.ui.keys import shortcut
+
+_MAX_TEXTURE_PX = 1024  # maximum longer side of a decal's picture on screen, pixels
+_MIN_ALPHA = 0.05  # smallest alpha that counts as painted
+
+
+def is_decal(path: Path) -> bool:
+    """Return True if a picture has both transparent and visible pixels.
+
+    Raises:
+        ProgdfError: it cannot be read.
+    """
+    picture = open_picture(path)
+    if not picture.has_transparency_data:
+        return False
+    low, high = picture.convert("RGBA").getchannel("A").getextrema()
+    return bool(isinstance(low, int) and isinstance(high, int) and low < 255 and high > 0)
+
+
+class DecalTextures:
+    """GL textures of the pictures of decals.
+
+    Args:
+        context: the GL context of the textures
+    """
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._textures: dict[int, moderngl.Texture] = {}  # by GL name
+
+    def __len__(self) -> int:
+        return len(self._textures)
+
+    def load(self, path: Path) -> Decal:
+        """Load a picture as a decal.
+
+        Raises:
+            ProgdfError: it cannot be read.
+        """
+        picture = open_picture(path).convert("RGBA")
+        picture.thumbnail((_MAX_TEXTURE_PX, _MAX_TEXTURE_PX))
+        pixels = np.asarray(picture)
+        texture = self._context.texture(picture.size, 4, pixels.tobytes(), alignment=1)
+        texture.build_mipmaps()
+        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self._textures[int(texture.glo)] = texture
+        return Decal(path, int(texture.glo), picture.size, pixels[..., 3] > 255 * _MIN_ALPHA)
+
+    def keep(self, transient: Transient) -> None:
+        """Free the textures of decals that are neither being placed nor in training."""
+        used = {ghost.texture for ghost in transient.ghosts if isinstance(ghost, DecalGhost)}
+        if isinstance(transient.gizmo, Decal):
+            used.add(transient.gizmo.texture)
+        for name in self._textures.keys() - used:
+            self._textures.pop(name).release()
 
 
 class PictureActions:
