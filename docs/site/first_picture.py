@@ -17,7 +17,7 @@ from typing import Any
 from playwright.sync_api import Browser, sync_playwright
 
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-WIDTH, HEIGHT = 1280, 800
+SIZE: Any = {"width": 1280, "height": 800}
 POLL_MS = 50
 LIMIT_MS = 300_000
 ENTRIES = """[...performance.getEntriesByType("paint"), ...performance.getEntriesByType("mark")]
@@ -30,7 +30,7 @@ PROCESSOR = "processor"
 
 def measure(browser: Browser, page: Path) -> dict[str, float]:
     """Open a page in a new tab. Return the seconds of `STILL`, `FIRST`, `SHARP` and `PROCESSOR`."""
-    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    context = browser.new_context(viewport=SIZE)
     tab = context.new_page()
     processes = browser.new_browser_cdp_session()
     before = _processor_seconds(processes)

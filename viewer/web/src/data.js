@@ -6,13 +6,7 @@ const word = new Uint32Array(1), real = new Float32Array(word.buffer);
 
 // Decodes and decompresses the base64 text of a gzip stream.
 export async function inflate(text) {
-  let packed;
-  if (Uint8Array.fromBase64) packed = Uint8Array.fromBase64(text);
-  else {
-    const letters = atob(text);
-    packed = new Uint8Array(letters.length);
-    for (let i = 0; i < letters.length; i++) packed[i] = letters.charCodeAt(i);
-  }
+  const packed = Uint8Array.fromBase64?.(text) ?? Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }

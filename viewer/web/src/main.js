@@ -13,9 +13,7 @@ const MOST_PIXELS = 4e6;
 const SLOW_MS = 45;  // slower frames in motion are drawn with fewer pixels
 const SHARES = [1, 0.5, 0.25, 0.125];  // of the width and height, in motion
 const FIRST_SHARE = 0.25;  // of the first picture, when the speed of the device is unknown
-const POLL_MS = 8;
-const REST_MS = 180;
-const GLIDE_MS = 250;
+const POLL_MS = 8, REST_MS = 180, GLIDE_MS = 250;
 
 class Page {
   get = (id) => this.root.querySelector(`#${id}`);
@@ -38,33 +36,26 @@ class Page {
     this.view = { layers: header.layers, groups: header.groups, blend: header.blend };
     this.home = this.camera = header.camera;
     this.radius = header.radius;
-    const original = { name: "original", ...this.view };
-    original.layers = original.layers.map((layer) => ({ ...layer, strength: 0 }));
+    const original = { name: "original", ...this.view, layers: header.layers.map((layer) => ({ ...layer, strength: 0 })) };
     this.snapshots = [original, ...header.snapshots];
-    this.chosen = null;  // index of the snapshot on screen, null after a change
-    this.frame = 0;
-    this.playing = false;
-    this.comparing = false;
-    this.times = { sharp: undefined, coarse: undefined };  // ms of the last frame at share 1, { share, ms } of another
+    Object.assign(this, { frame: 0, playing: false, comparing: false });
+    this.times = {};  // of the last frame with all pixels (sharp) and with fewer (coarse), ms
     this.update = buildPanel(this.get("controls"), this);
     this.#bind();
-    const touch = matchMedia("(pointer: coarse)").matches;
-    const zoom = this.takesWheel ? "scroll to zoom" : "click, then scroll to zoom";
+    const touch = matchMedia("(pointer: coarse)").matches, zoom = this.takesWheel ? "scroll to zoom" : "click, then scroll to zoom";
     this.get("notice").textContent = touch
       ? "Drag to turn · pinch to zoom · tap twice to center" : `Drag to turn · ${zoom} · Space compares`;
     root.classList.add("ready");
     this.resize();
     this.change(this.view);
-    this.movedAt = undefined;
-    this.used = false;  // whether the view or the camera has changed
+    this.movedAt = 0;  // nothing has moved yet
   }
 
   // Sets another view.
   change(view, chosen = null) {
     this.view = view;
-    this.chosen = chosen;
+    this.chosen = chosen;  // index of the snapshot on screen, null after a change
     this.dirty = true;
-    this.used = true;
     this.movedAt = performance.now();
     this.update();
     this.request();
@@ -75,7 +66,6 @@ class Page {
     this.camera = camera;
     this.movedAt = performance.now();
     this.turned = true;
-    this.used = true;
     this.request();
   }
 
@@ -91,10 +81,7 @@ class Page {
     if (this.snapshots[index].camera) this.glideTo(this.snapshots[index].camera);
   }
 
-  play() {
-    this.#film(!this.playing);
-    this.request();
-  }
+  play = () => this.#film(!this.playing);
 
   seek(frame) {
     const { view, camera } = stateAt(this.header.timeline, frame, this.view, this.camera);
@@ -140,15 +127,11 @@ class Page {
     const ratio = Math.min(devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
     this.canvas.width = Math.max(1, Math.round(width * ratio));
     this.canvas.height = Math.max(1, Math.round(height * ratio));
-    this.#alignStill();
     this.request();
   }
 
   request() {
-    this.pending ??= requestAnimationFrame((now) => {
-      this.pending = null;
-      this.#draw(now);
-    });
+    this.pending ??= requestAnimationFrame((now) => this.#draw(now));
   }
 
   // Returns the picture as a data URL of a PNG.
@@ -157,19 +140,12 @@ class Page {
     return this.canvas.toDataURL();
   }
 
-  // Puts the still where the first picture will be.
-  #alignStill() {
-    const [focal, , cx, cy] = this.#pinhole().intrinsics, pixels = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
-    const height = (2 * focal * Math.tan((this.camera.fov_y * Math.PI) / 360)) / pixels;
-    const { style } = this.get("still");
-    Object.assign(style, { left: `${cx / pixels}px`, top: `${cy / pixels}px`, height: `${height}px` });
-  }
-
   #film(playing) {
     this.playing = playing;
     this.lastFrame = null;
     this.glide = null;
     this.update();
+    this.request();
   }
 
   // The camera is centered on the free area beside the panel.
@@ -187,14 +163,10 @@ class Page {
 
   // Draws a frame, at a share of its width and height that the device draws in time if none is given.
   #draw(now, share = null) {
-    if (!this.canvas.clientWidth) {  // hidden, for example while a notebook changes its theme
-      this.resting = setTimeout(() => this.request(), REST_MS);
-      return;
-    }
-    if (share === null && this.drawing) {
-      this.again = true;
-      return;
-    }
+    if (share === null) this.pending = null;
+    if (!this.canvas.clientWidth) return;  // hidden, for example while a notebook changes its theme, until `resize`
+    this.again = share === null && this.drawing;
+    if (this.again) return;
     this.#advance(now);
     if (this.dirty) this.#compose();
     const at = this.#pinhole(), row = depthRow(at);
@@ -205,8 +177,8 @@ class Page {
       this.sorter.sort(row);
       this.sorting = false;
     }
-    if (!this.renderer.ordered) return;
-    const moving = now - (this.movedAt ?? -Infinity) < REST_MS;
+    if (this.renderer.drawn === null) return;  // not sorted yet
+    const moving = this.movedAt > now - REST_MS;
     if (moving) {
       clearTimeout(this.resting);
       this.resting = setTimeout(() => this.request(), REST_MS + 20);
@@ -217,40 +189,29 @@ class Page {
     this.shown?.();
   }
 
-  // Returns the share of the width and height at which a frame in motion takes at most SLOW_MS. Pixels take at most as
-  // long as the rest where the rest takes longer.
+  // Returns the share of the width and height at which a frame in motion takes about SLOW_MS.
   #share(moving) {
     const { sharp, coarse } = this.times;
-    if (!moving && (coarse || sharp !== undefined)) return 1;
-    if (sharp === undefined) return FIRST_SHARE;
-    const pixels = coarse ? Math.max(sharp - coarse.ms, 0) / (1 - coarse.share ** 2) : sharp, rest = sharp - pixels;
-    const room = Math.max(SLOW_MS - rest, rest);
-    return SHARES.find((share) => share ** 2 * pixels <= room) ?? SHARES.at(-1);
+    if (sharp === undefined && !coarse) return FIRST_SHARE;
+    if (!moving || coarse > sharp / 2) return 1;  // then fewer pixels do not help
+    return SHARES.find((share) => share ** 2 * sharp <= SLOW_MS) ?? SHARES.at(-1);
   }
 
-  // Waits until a frame is finished.
-  #watch(share) {
+  // Waits until a frame is finished, and notes its time.
+  async #watch(share) {
     const { gl } = this.renderer, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), start = performance.now();
-    const look = () => {
-      if (this.gone.signal.aborted || gl.isContextLost()) return;
-      if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) return void setTimeout(look, POLL_MS);
-      gl.deleteSync(fence);
-      this.drawing = false;
-      this.#finish(share, performance.now() - start);
-    };
     this.drawing = true;
     gl.flush();
-    setTimeout(look);
-  }
-
-  #finish(share, ms) {
-    const first = this.times.sharp === undefined;
-    if (share === 1) this.times.sharp = ms;
-    else this.times.coarse = { share, ms };
-    if (first) performance.mark(share === 1 ? "sharp picture" : "first picture");
-    if (share === 1 || this.used) this.root.classList.add("drawn");  // the still is sharp until then
+    do {
+      await new Promise((done) => setTimeout(done, POLL_MS));
+      if (this.gone.signal.aborted || gl.isContextLost()) return;
+    } while (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED);
+    gl.deleteSync(fence);
+    this.drawing = false;
+    if (this.times.sharp === undefined) performance.mark(share === 1 ? "sharp picture" : "first picture");
+    this.times[share === 1 ? "sharp" : "coarse"] = performance.now() - start;
+    if (share === 1 || this.movedAt) this.root.classList.add("drawn");  // the still is sharp until then
     if (this.again || this.times.sharp === undefined) this.request();
-    this.again = false;
   }
 
   #advance(now) {
@@ -294,19 +255,14 @@ class Page {
     press("fold", () => {
       const folded = root.classList.toggle("folded");
       get("fold").setAttribute("aria-expanded", !folded);
-      this.turned = true;
       this.request();
     });
     press("home", () => this.glideTo(this.home));
-    press("full", () => {
-      if (document.fullscreenElement) document.exitFullscreen();
-      else root.requestFullscreen?.();
-    });
+    press("full", () => (document.fullscreenElement ? document.exitFullscreen() : root.requestFullscreen?.()));
     const hold = get("compare");
     hold.addEventListener("pointerdown", () => this.compare(true));
-    for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) {
-      hold.addEventListener(name, () => this.compare(false));
-    }
+    const release = () => this.compare(false);
+    for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) hold.addEventListener(name, release);
     root.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.key === " ") {
@@ -320,7 +276,7 @@ class Page {
       event.preventDefault();
       this.compare(false);
     }, until);
-    addEventListener("blur", () => this.compare(false), until);
+    addEventListener("blur", release, until);
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
       root.classList.remove("drawn");

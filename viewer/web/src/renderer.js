@@ -36,8 +36,7 @@ export class Renderer {
     const rows = Math.max(1, Math.ceil(this.count / ORDER_ROW));
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, ORDER_ROW, rows);
     this.staged = new Uint32Array(ORDER_ROW * rows);
-    this.drawn = 0;
-    this.ordered = false;
+    this.drawn = null;  // number of Gaussians in order; null before the first order
     for (const name of Object.keys(LAYOUT)) this.#upload(name, container);
     gl.useProgram(this.splats.program);
     Object.keys(LAYOUT).forEach((name, at) => gl.uniform1i(this.splats.at(name), at));
@@ -74,7 +73,6 @@ export class Renderer {
     const { gl } = this, rows = Math.ceil(seen / ORDER_ROW);
     this.staged.set(order.subarray(0, seen));
     this.drawn = seen;
-    this.ordered = true;
     gl.activeTexture(gl.TEXTURE5);
     gl.bindTexture(gl.TEXTURE_2D, this.order);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ORDER_ROW, rows, gl.RED_INTEGER, gl.UNSIGNED_INT, this.staged);
