@@ -1,4 +1,4 @@
-"""Selection tools based on nearest neighbors: grow, shrink, smooth, refine, connected parts and cells."""
+"""Tools based on nearest neighbors: grow, smooth, refine, connected parts, cells, distance to a surface."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.system.equality import equal_fields
+from progdf.threads import run_chunks
 
 from .bounds import quantile
 from .point_tree import PointTree
@@ -37,6 +38,13 @@ _CELLS_ACROSS = 32  # cells of space along the longest side of an object
 _CELL_SPAN = 2 * _CELLS_ACROSS + 2  # cells along each side of the grid, with half an object on both sides
 _CORE_DEPTH_SHARE = 0.6  # share of the depth at `_DEPTH_QUANTILE`; members that lie deeper stay selected
 _DEPTH_QUANTILE = 0.95  # quantile of the members' depths, at most the width of the band; small in thin parts
+SURFACE_NEIGHBORS = 16
+"""Nearest opaque Gaussians through which a disc is fitted."""
+
+_MIN_NEIGHBORS = 3  # fewer define no plane
+_OPACITY_SHARE = 0.5  # share of the scene's total opacity that its opaque Gaussians hold
+_DISC_SIGMAS = 3.0  # the corner of an even square lies within this many standard deviations
+_CHUNK_ROWS = 1 << 14  # Gaussians measured at once
 
 
 class Neighborhood:
@@ -314,3 +322,107 @@ def _between(occupied: Mask, axis: int) -> Mask:
     after = np.flip(np.logical_or.accumulate(np.flip(occupied, axis), axis), axis)
     between: Mask = before & after
     return between
+
+
+def surface_distances(scene: Gaussians) -> NDArray[np.float64]:
+    """Return the distance of each center to the surface (1 000 000 Gaussians: 9 s on one core).
+
+    The surface near a Gaussian is a disc through its nearest opaque neighbors. A neighbor counts by the
+    density of the opaque centers around it, so that a dense surface outweighs the floaters beside it. The fit
+    is repeated once with smaller weights for the neighbors that lie off the first disc. The disc spans three
+    standard deviations of these centers: a floater level with a tabletop, but far outside it, is far from the
+    surface.
+
+    The distances turn, scale and reorder with the scene. They do not depend on the number of threads.
+
+    Args:
+        scene: N Gaussians
+
+    Returns:
+        Distances in world units, ≥ 0. NaN where the center is not finite, or where the scene has fewer than
+        three other opaque Gaussians. [N]
+
+    Raises:
+        StoppedError: see `run_chunks`.
+    """
+    points = scene.means.detach().double().numpy()
+    distances = np.full(len(points), np.nan)
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    opaque = finite[_most_opaque(scene.opacities.detach().double().numpy()[finite])]
+    neighbor_count = min(SURFACE_NEIGHBORS, len(opaque) - 1)
+    if neighbor_count < _MIN_NEIGHBORS:
+        return distances
+    surface = points[opaque]
+    tree = PointTree(surface, neighbor_count + 1)
+    densities = _densities(tree, surface, neighbor_count)
+    order = finite[PointTree(points[finite], 1).order]  # neighbors in space become neighbors in memory
+
+    def measure(chunk: int) -> None:
+        rows = order[chunk * _CHUNK_ROWS : (chunk + 1) * _CHUNK_ROWS]
+        found = tree.query(points[rows], neighbor_count + 1, workers=1)[1]
+        dropped = opaque[found] == rows[:, None]
+        dropped[~dropped.any(axis=1), -1] = True  # a Gaussian is not its own surface
+        neighbors = found[~dropped].reshape(len(rows), neighbor_count)
+        arms = surface[neighbors] - points[rows][:, None]
+        distances[rows] = _disc_distances(arms, densities[neighbors])
+
+    run_chunks(measure, -(-len(order) // _CHUNK_ROWS))
+    return distances
+
+
+def _most_opaque(opacities: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the Gaussians with the highest opacities, which hold half of the total. [N] -> [M]"""
+    known = np.nan_to_num(opacities)
+    descending = np.sort(known)[::-1]
+    total = descending.cumsum()
+    if not len(total) or total[-1] <= 0.0:
+        return np.zeros(0, np.int64)
+    least = descending[np.searchsorted(total, _OPACITY_SHARE * total[-1])]
+    return np.flatnonzero(known >= least)
+
+
+def _densities(tree: PointTree, points: NDArray[np.float64], neighbor_count: int) -> NDArray[np.float64]:
+    """Return the number of points per area around each point, relative to the sparsest, ≥ 1. [M,3] -> [M]"""
+    reach = np.empty(len(points))
+    order = tree.order
+
+    def measure(chunk: int) -> None:
+        rows = order[chunk * _CHUNK_ROWS : (chunk + 1) * _CHUNK_ROWS]
+        reach[rows] = tree.query(points[rows], neighbor_count + 1, workers=1)[0][:, -1]
+
+    run_chunks(measure, -(-len(order) // _CHUNK_ROWS))
+    largest = max(float(reach.max()), 1e-300)
+    densities: NDArray[np.float64] = (largest / reach.clip(1e-9 * largest)) ** 2
+    return densities
+
+
+def _disc_distances(neighbors: NDArray[np.float64], densities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distances of the origin to the discs through some points. [M,k,3], [M,k] -> [M]"""
+    center, normal, _ = _fit_discs(neighbors, densities)
+    heights = ((neighbors - center[:, None]) @ normal[:, :, None])[:, :, 0]
+    squares = heights * heights
+    typical = np.median(squares, axis=1, keepdims=True)
+    on_disc = np.divide(typical, typical + squares, out=np.ones_like(squares), where=squares > 0.0)
+    center, normal, radius = _fit_discs(neighbors, densities * on_disc)
+    height = (center * normal).sum(axis=1)
+    across = np.linalg.norm(center - height[:, None] * normal, axis=1)
+    distances: NDArray[np.float64] = np.hypot(height, np.maximum(across - radius, 0.0))
+    return distances
+
+
+def _fit_discs(
+    points: NDArray[np.float64], weights: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return centers [M,3], unit normals [M,3] and radii [M] of the discs through weighted points.
+
+    Args:
+        points: [M,k,3]
+        weights: at least one of each row is positive. [M,k]
+    """
+    shares = (weights / weights.sum(axis=1, keepdims=True))[:, None]
+    center = (shares @ points)[:, 0]
+    arms = points - center[:, None]
+    covariance = (shares * arms.transpose(0, 2, 1)) @ arms
+    variances, axes = np.linalg.eigh(covariance)  # ascending
+    radius = _DISC_SIGMAS * np.sqrt(variances[:, 1:].sum(axis=1).clip(0.0))
+    return center, axes[:, :, 0], radius

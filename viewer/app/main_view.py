@@ -61,11 +61,11 @@ from .decal import (
     place_decal,
 )
 from .inspect import frusta
-from .inspect.readouts import Distributions, Inspection
+from .inspect.readouts import Inspection
 from .messages import Messages
 from .pull import tool as pull_tool
 
-FIT_POLL_S = 0.25  # seconds between frames while a model of the surface under paint is computed
+FIT_POLL_S = 0.25  # seconds between frames while the surface under paint or a histogram is computed
 FLIGHT_S = 1 / 60  # seconds between frames while flying
 
 
@@ -102,7 +102,6 @@ class MainView:
         self.surfaces = Surfaces()
         self.decal_surfaces = DecalSurfaces()
         self.inspection = Inspection()
-        self.distributions = Distributions()
         self.paint = PaintOverlay(context)
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -138,6 +137,7 @@ class MainView:
         self.ui.close()
         self.surfaces.drop()
         self.decal_surfaces.drop()
+        self.inspection.distributions.drop()
         self.paint.release()
         self.canvas.release()
 
@@ -197,7 +197,7 @@ class MainView:
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
         waits += [SURFACE_POLL_S] if self.paint.pending else []
-        waits += [FIT_POLL_S] if self.paint.fits.is_busy else []
+        waits += [FIT_POLL_S] if self.paint.fits.is_busy or self.inspection.distributions.is_busy else []
         film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
@@ -342,7 +342,7 @@ class MainView:
                 compared = self.canvas.comparer.labels(self.work.view), self.work.before
                 self.store.replace(
                     interface.panels(
-                        self.work, self.pointer(), pictures, reveal, compared, self.distributions
+                        self.work, self.pointer(), pictures, reveal, compared, self.inspection.distributions
                     )
                 )
             self._revealed = self.work.focus, several

@@ -19,7 +19,7 @@ from viewer.ui.widgets import choice, drop_down, group_digits, hint, icon_button
 
 from .tools import EDGE_PX, LEFT_PX
 
-WIDTH_PX = 420.0  # at 1×, like the next ones
+WIDTH_PX = 476.0  # at 1×, like the next ones
 HEIGHT_PX = 92.0
 _FOOT_PX = 36.0  # room of the status line
 _GRIP_PX = 6.0  # distance within which an end of the range is dragged
@@ -27,12 +27,14 @@ _MODES = {"": "new", "Shift": "add", "Ctrl": "subtract"}
 """Modifier at the press, and the combination with the selection before it."""
 
 
-def draw(work: Workspace, found: Distribution, area: Area, ui: UiContext) -> tuple[Workspace, Plain | None]:
+def draw(
+    work: Workspace, found: Distribution | None, area: Area, ui: UiContext
+) -> tuple[Workspace, Plain | None]:
     """Draw the histogram over the lower right corner of the picture.
 
     Args:
         work: the state, with a histogram
-        found: histogram of its property
+        found: histogram of its property; None while it is computed
         area: the picture without the timeline
         ui: fonts and scale
 
@@ -49,7 +51,7 @@ def draw(work: Workspace, found: Distribution, area: Area, ui: UiContext) -> tup
         button = imgui.get_frame_height()
         names = {key: one.name for key, one in PROPERTIES.items()}
         room = wide - button - 4.0 * ui.scale
-        help_ = "Property of the splats. Drag over the bars to select a range"
+        help_ = f"{PROPERTIES[state.property].help}. Drag over the bars to select a range"
         if wide >= WIDTH_PX * ui.scale:
             pressed = choice("property", names, state.property, ui, room)
             tip(help_)
@@ -70,11 +72,23 @@ def draw(work: Workspace, found: Distribution, area: Area, ui: UiContext) -> tup
         hint("histogram")
         if pressed is not None and pressed != state.property:
             return with_transient(work, histogram=Histogram(pressed)), requested
+        if found is None:
+            _draw_wait(work, wide, ui)
+            return work, requested
         work = _draw_bars(work, state, found, wide, ui)
         state = work.transient.histogram or state
         small(_caption(work, state, found), PALETTE.dim, wide)
         tip("Shift adds to the selection, Ctrl subtracts from it")
     return work, requested
+
+
+def _draw_wait(work: Workspace, wide: float, ui: UiContext) -> None:
+    """Draw an empty field in place of the bars, with a line below."""
+    left, top = imgui.get_cursor_screen_pos()
+    low = (left + wide, top + HEIGHT_PX * ui.scale)
+    imgui.get_window_draw_list().add_rect_filled((left, top), low, u32(PALETTE.field), 3.0 * ui.scale)
+    imgui.dummy((wide, HEIGHT_PX * ui.scale))
+    small("Measuring …", PALETTE.dim, wide)
 
 
 def _caption(work: Workspace, state: Histogram, found: Distribution) -> str:

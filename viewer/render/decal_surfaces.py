@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.surface.find import PaintSurface, find_surface
 from progdf.surface.footprint import DepthPicture, depth_picture, near_surface
-from progdf.threads import StoppedError, stopped_by
 from viewer.camera.decal_warp import (
     DecalFrame,
     DecalMesh,
@@ -23,9 +18,7 @@ from viewer.camera.decal_warp import (
     warp_on_surface,
 )
 
-from .picking import run_in_background
-
-_T = TypeVar("_T")
+from .background import LatestResult
 
 _DISTANCES = (1.0, 0.5, 0.25)  # tried distances of the projecting camera, shares of the viewer's
 _MAX_SIDE_PX = 512  # largest longer side of the decal in its camera's picture, pixels; as in training
@@ -58,68 +51,12 @@ class _Inputs:
         return hash(self.others)
 
 
-class _Latest(Generic[_T]):
-    """Last result of a computation in another thread. A newer request replaces a waiting one."""
-
-    def __init__(self) -> None:
-        self._key: object = None
-        self._value: _T | None = None
-        self._pending: object = None  # key of the computation in progress
-        self._stop = threading.Event()
-
-    def get(self, key: object, make: Callable[[], _T]) -> _T | None:
-        """Return the result for a key; None while it is computed."""
-        if key != self._key:
-            self.drop()
-            self._key = key
-            self._pending = key
-            self._stop = threading.Event()
-            run_in_background(self._compute, key, make, self._stop)
-        return self._value
-
-    def finish(self, key: object, make: Callable[[], _T]) -> _T:
-        """Return the result for a key; compute it at once if needed."""
-        value = self._value
-        if value is None or not self.has(key):
-            value = make()
-            self.drop()
-            self._key = key
-            self._value = value
-        return value
-
-    def has(self, key: object) -> bool:
-        """Return True if the result for a key is available."""
-        return key == self._key and self._value is not None
-
-    @property
-    def is_busy(self) -> bool:
-        """True if a requested result is missing."""
-        return self._pending is not None
-
-    def drop(self) -> None:
-        """Cancel the computation and forget the result."""
-        self._stop.set()
-        self._key = self._value = self._pending = None
-
-    def _compute(self, key: object, make: Callable[[], _T], stop: threading.Event) -> None:
-        if stop.is_set():
-            return
-        try:
-            with stopped_by(stop), suppress(StoppedError):
-                value = make()
-                if key is self._key:
-                    self._value = value
-        finally:
-            if key is self._pending:
-                self._pending = None
-
-
 class DecalSurfaces:
     """Cache of the surfaces under the decal being placed. `drop` it with the scene."""
 
     def __init__(self) -> None:
-        self._depth = _Latest[DepthPicture]()
-        self._laid = _Latest[LaidDecal]()
+        self._depth = LatestResult[DepthPicture]()
+        self._laid = LatestResult[LaidDecal]()
 
     def depth(self, scene: Gaussians, camera: Camera, at_once: bool = False) -> DepthPicture | None:
         """Return the depth picture of a camera; None while it is computed.

@@ -44,7 +44,7 @@ from viewer.camera.view_camera import ViewCamera, to_camera
 from viewer.state.transient import ColorDrag
 from viewer.state.view_state import PaintedPicture
 
-from .picking import run_in_background
+from .background import run_in_background
 
 Size = tuple[int, int]
 SurfaceOf = Callable[[PaintedPicture], ViewSurface]

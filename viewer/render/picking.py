@@ -5,9 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 import torch
@@ -23,6 +21,8 @@ from progdf.system.equality import equal_fields
 from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
+
+from .background import run_in_background
 
 SURFACE_OPACITY = 0.5  # accumulated opacity that defines the surface
 BACKGROUND_OPACITY = 0.05  # accumulated opacity below which a pixel is background
@@ -237,13 +237,3 @@ class Surfaces:
         if self._surface is not None:
             self._surface.drop()
         self._key = self._surface = None
-
-
-def run_in_background(work: Callable[..., object], *arguments: object) -> None:
-    """Run `work` in another thread, after the work submitted earlier."""
-    _worker().submit(work, *arguments)
-
-
-@cache
-def _worker() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, thread_name_prefix="ahead")

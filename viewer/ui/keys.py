@@ -262,7 +262,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         ),
         Command("pull", "Pull", "Shift+P", "Drag the surface, and the rest follows", row=JOINED),
         Command("duplicate_selected", "Copy selection", "Alt+D", "Add a layer with a copy to place"),
-        Command("histogram", "Histogram", "Shift+I", "Drag a range of size, opacity or color to select"),
+        Command("histogram", "Histogram", "Shift+I", "Drag a range of size, opacity, color … to select"),
         Command("hide_strays", "Hide strays", "", "Floaters, needles, giants and invisible splats"),
     ),
     "Timeline": (

@@ -17,9 +17,10 @@ from progdf.painting.projection import ViewSurface, fitted_surface, is_apart, vi
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import Floats, Mask, Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
+from viewer.render.background import run_in_background
 from viewer.render.engine import ViewEngine
 from viewer.render.paint_overlay import PaintOverlay, pixels_of, quick_under, surface_key
-from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces, run_in_background
+from viewer.render.picking import PREPARE_MIN_GAUSSIANS, Surfaces
 from viewer.state.layers import is_visible
 from viewer.state.selection import EMPTY_MASK, unpack
 from viewer.state.view_state import PaintedPicture, ViewState
@@ -166,7 +167,7 @@ class PointerContext:
                 view = to_camera(picture.camera, *picture.size)
                 seen = self.paint.surfaces.peek(surface_key(self.scene_key, view))
                 if seen is not None and not fits.is_requested(self.scene_key, picture):
-                    scene = self._copy_scene()
+                    scene = self.copy_scene()
                     painted = pixels_of(picture)[..., 3] > 0
                     fits.request(self.scene_key, picture, partial(fitted_surface, scene, seen, painted))
                 return
@@ -219,15 +220,15 @@ class PointerContext:
         known = self.paint.surfaces.peek(key)
         self.paint.pending = request and known is None
         if self.paint.pending and self.paint.surfaces.is_awaited(key):
-            self.paint.surfaces.request(key, partial(view_surface, self._copy_scene(), view))
+            self.paint.surfaces.request(key, partial(view_surface, self.copy_scene(), view))
         return known
 
     @property
     def _surface_key(self) -> object:
         return surface_key(self.scene_key, self.camera(self.shown.camera))
 
-    def _copy_scene(self) -> Gaussians:
-        """Return a copy of the scene that later strengths do not change."""
+    def copy_scene(self) -> Gaussians:
+        """Return the scene; later strengths do not change the attributes of `_SURFACE` in it."""
         scene = self.scene
         if self.shown.layers:
             copies: dict[str, Any] = {name: getattr(scene, name).clone() for name in _SURFACE}
@@ -235,4 +236,4 @@ class PointerContext:
         return scene
 
     def _copy_surface(self) -> Surface:
-        return Surface(self._copy_scene(), self.camera(self.shown.camera))
+        return Surface(self.copy_scene(), self.camera(self.shown.camera))

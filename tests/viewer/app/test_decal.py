@@ -235,7 +235,9 @@ def test_surface_is_found_once_per_decal_in_a_bounded_picture(
         raise StoppedError
 
     monkeypatch.setattr("viewer.render.decal_surfaces.find_surface", find)
-    monkeypatch.setattr("viewer.render.decal_surfaces.run_in_background", lambda work, *given: work(*given))
+    monkeypatch.setattr(
+        "viewer.render.background.run_in_background", lambda work, *given, thread: work(*given)
+    )
     with rig_with(logo) as hand:
         decal = shown(hand)
         assert decal.frame is not None

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 
 from tests.helpers.ui_rig import Rig, rig
 from viewer.app.inspect.readouts import describe
+from viewer.app.main_view import FIT_POLL_S
 from viewer.render.picking import PixelGaussians
 from viewer.state.commands import Plain, WithText
 from viewer.state.selection import unpack
 from viewer.state.transient import Histogram
+from viewer.state.workspace import with_transient
 
 
 @pytest.mark.gl
@@ -63,6 +68,35 @@ def test_dragged_range_of_the_histogram_selects_as_one_undo_step() -> None:
         assert hand.main_view.work.view.selection.count == 0
         hand.key("Shift+I")
         assert hand.main_view.work.transient.histogram is None
+
+
+@pytest.mark.gl
+def test_slow_histogram_is_computed_in_the_background(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting: list[Callable[[], object]] = []
+
+    def keep(work: Callable[..., object], *given: object, thread: str) -> None:
+        waiting.append(partial(work, *given))
+
+    monkeypatch.setattr("viewer.app.inspect.readouts._DIRECT_MS", 0.0)
+    monkeypatch.setattr("viewer.render.background.run_in_background", keep)
+    with rig() as hand:
+        hand.key("Shift+I")
+        hand.main_view.store.replace(
+            with_transient(hand.main_view.work, histogram=Histogram(property="surface"))
+        )
+        hand.event()
+        hand.settle()
+        assert len(waiting) == 2, "size, then the distance to the surface"
+        assert hand.main_view.next_frame_delay() == FIT_POLL_S
+        left, top = _corner_of_bars(hand)
+        hand.drag((left + 60, top + 30), (left + 120, top + 30))
+        assert hand.main_view.work.view.selection.count == 0
+        for work in waiting:
+            work()
+        hand.event()
+        hand.drag((left + 60, top + 30), (left + 120, top + 30))
+        assert hand.main_view.work.view.selection.count > 0
+        assert len(waiting) == 2, "it is computed once"
 
 
 @pytest.mark.gl

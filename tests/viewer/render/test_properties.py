@@ -33,6 +33,18 @@ def test_adjacent_ranges_share_no_gaussian(name: str) -> None:
     assert len(found.counts) == BINS
 
 
+def test_range_of_surface_distances_selects_the_gaussians_off_a_plane() -> None:
+    scene = random_gaussians(1000)
+    random = np.random.default_rng(0)
+    means = np.zeros((1000, 3))
+    means[:, :2] = random.random((1000, 2))
+    means[::100, 2] = 0.05
+    scene = replace(scene, means=torch.tensor(means, dtype=torch.float32))
+    found = distribution(scene, "surface")
+    chosen = rows_between(found, math.log10(0.025), found.high)
+    assert np.flatnonzero(chosen).tolist() == [*range(0, 1000, 100)]
+
+
 def test_scene_with_broken_rows_has_a_histogram() -> None:
     scene = random_gaussians(20)
     scene.log_scales[3] = math.nan

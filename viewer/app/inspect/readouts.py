@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from imgui_bundle import imgui, imgui_ctx
 from numpy.typing import NDArray
 
+from progdf.gaussians import Gaussians
 from progdf.system.equality import equal_fields
 from progdf.system.processes import resident_bytes
+from progdf.threads import without_pool
+from viewer.render.background import LatestResult
 from viewer.render.picking import PREPARE_MIN_GAUSSIANS, PixelGaussians, outlines, seen_at
-from viewer.render.properties import Distribution, distribution
+from viewer.render.properties import PROPERTIES, Distribution, distribution
 from viewer.render.view_modes import CONTRIBUTION, visible_count
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
@@ -25,6 +29,7 @@ MAX_OUTLINES = 24  # number of outlines around the pixel, those with the largest
 HALF = 0.5  # share of the color that the second line of the readout counts to
 _IDLE_S = 0.25  # a longer time between two frames is no frame rate
 _RATE_FRAMES = 20  # frames averaged for the rate
+_DIRECT_MS = 50.0  # processor time above which a histogram is computed in the background
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Inspection:
         self._probe = _Probe(None)
         self._frames: deque[float] = deque(maxlen=_RATE_FRAMES)  # seconds between frames in motion
         self._visible: tuple[object, int] = (None, 0)  # key of the picture and its visible Gaussians
+        self.distributions = Distributions()
 
     def step(self, seconds: float) -> None:
         """Record the time since the last frame."""
@@ -104,17 +110,53 @@ class Inspection:
 
 
 class Distributions:
-    """Histogram of one property of the scene on screen, computed once."""
+    """Histograms of the scene on screen, each computed once. `drop` them with the window."""
 
     def __init__(self) -> None:
-        self._known: tuple[object, Distribution] | None = None
+        self._scene: object = None  # key of the scene of the known histograms
+        self._known: dict[str, Distribution] = {}
+        self._requested = ""  # property of the histogram in the background
+        self._latest = LatestResult[Distribution]("histogram")
 
-    def get(self, name: str, pointer: PointerContext) -> Distribution:
-        """Return the histogram of a property. `name`: key of `PROPERTIES`"""
-        key = (name, pointer.scene_key)
-        if self._known is None or self._known[0] != key:
-            self._known = key, distribution(pointer.scene, name)
-        return self._known[1]
+    def get(self, name: str, pointer: PointerContext) -> Distribution | None:
+        """Return the histogram of a property; None while it is computed. `name`: key of `PROPERTIES`"""
+        if self._scene != pointer.scene_key:
+            self.drop()
+            self._scene = pointer.scene_key
+        found = self._known.get(name)
+        if found is None:
+            found = self._find(name, pointer)
+        if found is not None:
+            self._known[name] = found
+        return found
+
+    def _find(self, name: str, pointer: PointerContext) -> Distribution | None:
+        if 1e-3 * PROPERTIES[name].us * pointer.facts.count <= _DIRECT_MS:
+            return distribution(pointer.scene, name)
+        if name == self._requested:
+            return self._latest.value
+        if imgui.is_any_item_active():  # a slider changes the scene again in the next frame
+            return None
+        self._requested = name
+        return self._latest.get((name, self._scene), partial(_compute_alone, pointer.copy_scene(), name))
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a histogram is computed."""
+        return self._latest.is_busy
+
+    def drop(self) -> None:
+        """Cancel the computation and forget the histograms."""
+        self._known = {}
+        self._scene = None
+        self._requested = ""
+        self._latest.drop()
+
+
+def _compute_alone(scene: Gaussians, name: str) -> Distribution:
+    """Return the histogram of a property, on one thread, which leaves the others to the window."""
+    with without_pool():
+        return distribution(scene, name)
 
 
 def memory() -> str:
