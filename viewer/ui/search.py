@@ -8,14 +8,20 @@ from .keys import TOPICS, Command, chords
 
 WORDS = {
     "new_edit": "hue, recolor, color, colour, tint, style, prompt, layer, add layer, new layer, filter, AI, "
-    "generate, texture, material",
+    "generate, texture, material, diffusion, style transfer",
     "new_grade": "grade, color grading, hue, saturation, brightness, contrast, exposure, white balance, "
-    "temperature, vibrance, shadows, highlights, curve, color wheels, look",
+    "temperature, vibrance, shadows, highlights, curve, color wheels, look, tint, clarity, sharpen, "
+    "black and white, grayscale, desaturate, sepia, warm, cold, light",
+    "view_settings": "background color, field of view, fov, lens, focal length, perspective, options",
+    "flip_up": "upside down, straighten, horizon, wrong way up",
+    "look:top": "bird's eye, plan view",
+    "navigate:orbit": "rotate view, pan, turntable camera",
     "show_looks": "rename look, delete look, presets, LUT folder",
-    "open": "LUT, cube, import, load, drop",
-    "add_scene": "merge, second, combine, import, append",
-    "fold": "opacity, transparency, alpha, fade, gain",
-    "remove_selected": "erase, eraser, cut out, cut, clear, inpaint, get rid of",
+    "open": "LUT, cube, import, load, drop, recent, open recent",
+    "add_scene": "merge, second, combine, import, append, add object",
+    "fold": "opacity, transparency, alpha, fade, gain, layer opacity",
+    "remove_selected": "erase, eraser, cut out, cut, clear, inpaint, get rid of, delete object, "
+    "delete splats",
     "remove": "delete layer, trash",
     "move_selected": "rotate, scale, resize, transform, translate, gizmo, mirror, flip, place",
     "duplicate_selected": "duplicate object, paste, clone object, instance",
@@ -28,15 +34,17 @@ WORDS = {
     "select_subject": "foreground, main object, auto mask, person",
     "isolate": "crop, trim, only this, keep only, solo selection",
     "hide_selected": "invisible",
-    "hide_strays": "floaters, clean, cleanup, noise, outliers, fog, haze",
+    "hide_strays": "floaters, clean, cleanup, noise, denoise, outliers, fog, haze",
     "show_hidden": "unhide, reveal",
     "select_none": "deselect",
+    "select_all": "select all",
+    "select_grow": "expand selection",
     "invert": "inverse, opposite",
     "brush": "layer mask, mask brush, local, strength brush",
     "paint_tool:color": "draw, pen, pencil, paint, airbrush, brush",
     "paint_tool:clone": "heal, stamp, retouch, copy brush",
     "paint_view": "photoshop, gimp, krita, external editor, draw over",
-    "decal": "sticker, logo, text, label, image, picture, poster, tattoo",
+    "decal": "sticker, logo, text, label, image, picture, poster, tattoo, watermark",
     "undo": "back, revert, mistake",
     "history": "versions, undo list",
     "reset": "zero, default, neutral",
@@ -57,18 +65,20 @@ WORDS = {
     "view_mode:opacity": "transparency, alpha, opacity map",
     "view_mode:contribution": "which splats, overdraw, pixel, probe, inspect",
     "cameras": "frustum, frusta, photographs, poses, colmap, views",
-    "histogram": "distribution, filter by size, select by size, levels, threshold, range",
+    "histogram": "distribution, filter by size, select by size, levels, threshold, range, far from surface, "
+    "outliers",
     "status": "stats, statistics, fps, memory, count, performance",
     "view_mode:splats": "normal view, color",
     "grid": "floor, ground",
     "measure": "ruler, distance, length, size, scale, units, tape",
-    "timeline": "animate, animation, keyframes, video editor",
+    "timeline": "animate, animation, keyframes, video editor, camera path, fly through, walkthrough, "
+    "slideshow",
     "key": "record",
     "safe_frame": "aspect, crop frame, letterbox, 9:16, portrait",
     "picture": "screenshot, capture, photo, snapshot picture, snip",
     "render_picture": "image, high resolution, 4K, wallpaper, transparent, export image",
     "render_film": "turntable, video, movie, mp4, gif, spin, clip, export video",
-    "export": "ply, download, save scene, splat file",
+    "export": "ply, spz, download, save scene, splat file",
     "export_page": "share, publish, web, html, link, embed, upload, send",
     "save": "project, store",
     "camera": "bookmark, viewpoint, save camera",
@@ -77,6 +87,7 @@ WORDS = {
     "help": "shortcuts, hotkeys, keyboard, manual, tutorial, controls",
     "dynamic_resolution": "performance, slow, lag, quality, speed",
     "zoom:1.1": "font size, bigger text, UI scale",
+    "quit": "exit, close program",
     "panel": "hide interface, clean view, sidebar, presentation",
     "full_screen": "fullscreen, maximize",
     "reduced_motion": "accessibility, animation off",
@@ -92,11 +103,13 @@ def match(query: str, name: str, words: str = "", beside: str = "") -> int | Non
         query: typed text
         name: name of the command
         words: everyday words for it, separated by commas
-        beside: other text to search if neither matches
+        beside: other text to search if neither matches. A query of several words also matches if each of them
+            is somewhere in the three texts
     """
     needle = query.casefold().strip()
     text = name.casefold()
     known = [word.strip() for word in words.casefold().split(",")]
+    everything = f"{text} {words.casefold()} {beside.casefold()}"
     letters = iter(text)
     matches = (
         text.startswith(needle),
@@ -107,6 +120,7 @@ def match(query: str, name: str, words: str = "", beside: str = "") -> int | Non
         needle in text,
         any(needle in word for word in known),
         needle in beside.casefold(),
+        all(part in everything for part in needle.split()),
         all(letter in letters for letter in needle.replace(" ", "")),  # in this order, with gaps
     )
     return next((i for i, is_match in enumerate(matches) if is_match), None)

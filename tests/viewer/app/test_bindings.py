@@ -85,6 +85,7 @@ def test_every_action_is_a_command_or_internal(tmp_path: Path) -> None:
         ("rend pic", "render_picture"),
         ("ctrl+shift+p", "render_film"),
         ("expscn", "export"),  # letters in their order
+        ("object middle subject", "select_subject"),  # words of its name and help, in any order
     ],
 )
 def test_command_is_found_by_parts_of_its_name(query: str, first: str) -> None:
@@ -113,8 +114,22 @@ FIRST_GUESSES = {
     "ruler": "measure",
     "zoom to fit": "frame",
     "heal": "paint_tool:clone",
+    "black and white": "new_grade",
+    "sharpen": "new_grade",
+    "background color": "view_settings",
+    "fov": "view_settings",
+    "upside down": "flip_up",
+    "top view": "look:top",
+    "recent": "open",
+    "exit": "quit",
+    "watermark": "decal",
+    "walkthrough": "timeline",
+    "expand selection": "select_grow",
+    "delete object": "remove_selected",
+    "denoise": "hide_strays",
+    "spz": "export",
 }
-"""First word that a newcomer may type for a task, and the command of the task."""
+"""First words that a newcomer may type for a task, and the command of the task."""
 VISIBLE_ROWS = 3  # rows at which one looks before typing another word
 
 
