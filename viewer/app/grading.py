@@ -59,7 +59,7 @@ class GradePreview:
         self._sheet: moderngl.Texture | None = None
         self._looks: tuple[tuple[str, str], ...] | None = None  # None: to be read again
         self._drawn: tuple[RegionSample, tuple[tuple[str, str], ...]] | None = None  # inputs of the sheet
-        self._scope_of: tuple[object, bool, LiveGrade | None] | None = None
+        self._scope_of: tuple[object, ...] | None = None  # inputs of the histogram
 
     @property
     def requests(self) -> Requests:
@@ -143,15 +143,14 @@ class GradePreview:
         self._grader.rows = region_files.region_rows(work.form, work.view.selection, count)
 
     def _update_scope(self, live: LiveGrade | None) -> None:
-        """Compute the histogram again after a change."""
-        sample = self._grader.sample
-        is_empty = self._grader.is_empty
-        known = self._scope_of
-        if known is not None and known[0] is sample and known[1:] == (is_empty, live):
+        """Compute the histogram again after a change: quickly during a drag, exactly after it."""
+        is_moving = bool(imgui.is_any_item_active())
+        inputs = (self._grader.sample, self._grader.is_empty, live, is_moving)
+        if self._scope_of == inputs:
             return
-        self._scope_of = sample, is_empty, live
-        work = self._store.get()
-        self._store.replace(with_transient(work, scope=self._grader.scope(live)))
+        self._scope_of = inputs
+        scope = self._grader.scope(live, is_moving)
+        self._store.replace(with_transient(self._store.get(), scope=scope))
         self._store.wake()
 
     def _update_shelf(self) -> None:

@@ -7,7 +7,7 @@ effect, because the drawn color includes them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -37,6 +37,43 @@ _CHUNK_ROWS = 1 << 14  # rows that one thread shades at once
 _SCOPE_COLORS = 4096  # largest number of sampled colors of the histogram
 
 
+class GradeLattice:
+    """Lattice of colors under the newest grade. Each point is graded once, whoever looks it up.
+
+    A new grade is evaluated at once at all points that the last one was looked up at. In a drag, the picture
+    and the histogram therefore share one evaluation per frame.
+    """
+
+    def __init__(self) -> None:
+        self._live: LiveGrade | None = None
+        self._colors = lattice_colors(SIDE).float()
+        self._graded = self._colors.clone()
+        self._known = torch.zeros(SIDE**3, dtype=torch.bool)
+
+    def look_up(self, colors: Tensor, points: Tensor, live: LiveGrade) -> Tensor:
+        """Return graded colors, interpolated between lattice points. [M,3] -> [M,3]
+
+        Args:
+            colors: sRGB colors, 0 to 1. [M,3]
+            points: their lattice points, see `used_points`. [K] int64
+            live: the grade
+        """
+        if self._live is None or not self._live.is_same_grade(live):
+            due = self._known.clone()
+            due[points] = True
+            self._known.zero_()
+            self._live = live
+        else:
+            due = torch.zeros_like(self._known)
+            due[points] = True
+            due &= ~self._known
+        rows = due.nonzero()[:, 0]
+        if len(rows):
+            self._graded[rows] = _at_strength(self._colors[rows], live)
+        self._known[points] = True
+        return look_up(colors.T, self._graded).T
+
+
 @dataclass(frozen=True)
 class LiveGrade:
     """Grade of some Gaussians at a strength."""
@@ -46,14 +83,18 @@ class LiveGrade:
     strength: float = 1.0  # 0 to 1
     marks: bool = False  # show clipped colors: white in red, black in blue
     table: Tensor | None = None  # color table instead of the grade, see `look_up`. [side³,3]
+    lattice: GradeLattice = field(default_factory=GradeLattice)  # shared by the grades of a form
+
+    def is_same_grade(self, other: LiveGrade) -> bool:
+        """Return True if another one changes every color alike."""
+        return self.table is other.table and self.grade is other.grade and self.strength == other.strength
 
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, LiveGrade)
             and self.rows is other.rows
-            and self.table is other.table
-            and self.grade is other.grade
-            and (self.strength, self.marks) == (other.strength, other.marks)
+            and self.is_same_grade(other)
+            and self.marks == other.marks
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -103,9 +144,7 @@ class ColorTable:
             if detail is not None and clarity:
                 inside = clarify(inside, detail, clarity * live.strength)
                 points = used_points(inside)
-            table = lattice_colors(SIDE).float()
-            table[points] = _at_strength(table[points], live)
-            graded = look_up(inside.T, table).T
+            graded = live.lattice.look_up(inside, points, live)
         if live.marks:
             white, black = clipped_colors(graded)
             graded = graded.clone()
@@ -230,6 +269,7 @@ class FormGrader:
         """Sample of the region's colors; None if it is not known yet."""
         self._last: tuple[object, LiveGrade | None] | None = None
         self._measured: tuple[object, ColorGrade] | None = None
+        self._lattice = GradeLattice()
 
     @property
     def is_empty(self) -> bool:
@@ -246,13 +286,18 @@ class FormGrader:
             self._last = key, self._new(spec, self.rows)
         live = self._last[1]
         if live is None and form.clipping:
-            live = LiveGrade(self.rows, ColorGrade())
+            live = LiveGrade(self.rows, ColorGrade(), lattice=self._lattice)
         if live is None or not (form.strength or form.clipping):
             return None
         return replace(live, strength=form.strength, marks=form.clipping)
 
-    def scope(self, live: LiveGrade | None) -> GradeScope:
-        """Return the histogram of the region's colors under a grade; empty before they are known."""
+    def scope(self, live: LiveGrade | None, is_moving: bool = False) -> GradeScope:
+        """Return the histogram of the region's colors under a grade; empty before they are known.
+
+        Args:
+            live: the grade; None for none
+            is_moving: interpolate the graded colors on the lattice of the picture in motion
+        """
         sample = self.sample
         if self.is_empty:
             return GradeScope(note="The region is empty: select something")
@@ -260,7 +305,9 @@ class FormGrader:
             return GradeScope()
         stride = -(-len(sample.colors) // _SCOPE_COLORS)
         colors = torch.from_numpy(sample.colors[::stride]).clamp(0.0, 1.0)
-        if live is not None:
+        if live is not None and is_moving:
+            colors = live.lattice.look_up(colors, used_points(colors), live)
+        elif live is not None:
             colors = _at_strength(colors, live)
         weights = torch.from_numpy(sample.shares[::stride]).double()
         luma = colors @ colors.new_tensor([0.2126, 0.7152, 0.0722])
@@ -292,7 +339,8 @@ class FormGrader:
         """Return the grade of a form's editor, or a color table; None if it changes nothing."""
         try:
             if spec.startswith(CUBE_LOOK):
-                return LiveGrade(rows, ColorGrade(), table=read_cube(spec.removeprefix(CUBE_LOOK)))
+                table = read_cube(spec.removeprefix(CUBE_LOOK))
+                return LiveGrade(rows, ColorGrade(), table=table, lattice=self._lattice)
             grade = parse_grade(spec.partition(":")[2])
         except ProgdfError:
             return None
@@ -306,4 +354,4 @@ class FormGrader:
             shadings = self._measured[1].palette_shadings
             shades = self._measured[1].palette_shades
             grade = replace(grade, palette_shadings=shadings, palette_shades=shades)
-        return LiveGrade(rows, grade)
+        return LiveGrade(rows, grade, lattice=self._lattice)

@@ -81,7 +81,7 @@ def test_lattice_of_used_points_equals_the_whole_lattice(monkeypatch: pytest.Mon
     live = LiveGrade(np.arange(len(colors)), GRADE)
     exact = ColorTable(colors).apply(live)
     monkeypatch.setattr(live_grade, "SIDE", 9)
-    few = ColorTable(colors).apply(live)
+    few = ColorTable(colors).apply(LiveGrade(live.rows, GRADE))
     table = grade_fully(lattice_colors(9).float(), GRADE)
     assert torch.allclose(few, look_up(colors.T, table).T, atol=1e-6)
     assert (few - exact).abs().mean() < 0.02
@@ -199,6 +199,48 @@ def test_clipped_colors_are_marked_and_counted() -> None:
     scope = grader.scope(None)
     assert (scope.white, scope.black) == (0.25, 0.25)
     assert [len(row) for row in scope.bins] == [live_grade.BINS] * 4
+
+
+def test_picture_and_histogram_in_motion_share_one_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    colors = 0.4 + 0.2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(1))
+    grader = FormGrader()
+    grader.sample = sample_of(colors)
+    grader.rows = grader.sample.rows
+    drawn = LiveColors()
+    counts = []
+    plain = live_grade._at_strength
+
+    def count(colors: torch.Tensor, live: LiveGrade, *detail: torch.Tensor | None) -> torch.Tensor:
+        counts.append(len(colors))
+        return plain(colors, live, *detail)
+
+    def frame(look: str) -> torch.Tensor:
+        live = grader.live(with_look(FORM, look))
+        assert live is not None
+        grader.scope(live, is_moving=True)
+        return drawn.recolor(live, colors, None)
+
+    monkeypatch.setattr(live_grade, "_at_strength", count)
+    frame("grade:exposure=0.3")
+    counts.clear()
+    graded = frame("grade:exposure=0.4")
+    assert len(counts) == 1
+    exact = grade_fully(colors, parse_grade("exposure=0.4"))
+    assert (graded - exact).abs().mean() < 0.002
+
+
+def test_histogram_at_rest_is_exact_and_close_to_that_in_motion() -> None:
+    colors = torch.rand(2000, 3, generator=torch.Generator().manual_seed(1))
+    grader = FormGrader()
+    grader.sample = sample_of(colors)
+    grader.rows = grader.sample.rows
+    live = grader.live(with_look(FORM, "grade:exposure=0.4"))
+    assert live is not None
+    rest = grader.scope(live)
+    values = grade_fully(colors, live.grade)
+    assert rest.white == pytest.approx(float((values.amax(dim=1) > 1.0 - 0.5 / 255).float().mean()))
+    moving = grader.scope(live, is_moving=True)
+    assert np.abs(np.subtract(moving.bins, rest.bins)).mean() < 0.03
 
 
 def test_form_is_graded_before_its_sample_has_arrived() -> None:
