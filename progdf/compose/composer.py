@@ -21,6 +21,7 @@ from progdf.field.baked import Segment, find_segment
 from progdf.field.stored_bases import StoredBases
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.motions import PartMotions
 from progdf.gdf.texture import ColorSplit, Split, color_split
 from progdf.threads import run_chunks
 
@@ -159,13 +160,19 @@ class Composer:
         self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
         self._touched: set[int] = set()  # edits whose offsets were written in place
 
-    def touch(self, gdf: Gdf) -> None:
+    def touch(self, gdf: Gdf, motions: PartMotions | None = None) -> None:
         """Let the next update read the offsets of an edit again, after they were written in place.
 
         The offsets are float32, as an edit in progress has them.
+
+        Args:
+            gdf: the edit
+            motions: its motions from now on, if it was given with motions; None keeps them
         """
         edit = self._edit_of(gdf)
         self._touched.add(edit)
+        if motions is not None and self._carrier is not None:
+            self._carrier.set_motions(edit, motions)
         if self._surface is not None:
             self._surface.touch(edit, self._gdfs[edit])
 

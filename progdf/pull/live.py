@@ -7,6 +7,7 @@ place.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -20,10 +21,13 @@ from torch import Tensor
 from progdf.compose.composer import Composer
 from progdf.compose.layers import DEFAULT_BLEND, Layer
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.gaussians import Gaussians, attribute_slices, pack
+from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf, fingerprint
+from progdf.gdf.motions import linear_map
+from progdf.quaternions import multiply_quats
 from progdf.rasterize.cpu.compilation import compile_elsewhere, is_compiled, mark_compiled
 from progdf.region import Region, from_mask, whole_scene
+from progdf.similarity import AffineMotion, transform_rows
 from progdf.system.equality import equal_fields
 
 from .course import Handle, make_problem
@@ -195,6 +199,43 @@ def write_offsets(edit: Gdf, offsets: Tensor) -> None:
     slices = attribute_slices(edit.field.channels)
     for attribute, bases in edit.field.attributes.items():
         bases.end_offset.copy_(offsets[:, slices[attribute]])
+
+
+def write_move(edit: Gdf, rows: Tensor, motion: AffineMotion) -> None:
+    """Write the offsets of a move into an edit in progress, in place.
+
+    A similarity maps all rows by the same matrices, which takes a tenth of the time of `transform_rows`.
+
+    Args:
+        edit: see `edit_in_progress`
+        rows: raw rows of its members before the move, packed. [M,C] float32
+        motion: with its pivot
+    """
+    slices = attribute_slices(edit.field.channels)
+    bands = edit.field.channels - BASE_CHANNELS
+    moved = linear_map([motion], 1.0, bands // 3)
+    if motion.mirror is not None or motion.pivot is None or not moved.is_similar:
+        exact = rows.double()
+        write_offsets(edit, transform_rows(exact, motion) - exact)
+        return
+    offsets = {name: bases.end_offset for name, bases in edit.field.attributes.items()}
+    arms = rows[:, slices["means"]].double() - motion.pivot
+    offsets["means"].copy_(arms @ (moved.matrix - torch.eye(3, dtype=torch.float64)).T + motion.shift)
+    offsets["log_scales"].fill_(moved.log_scale)
+    if not motion.turns_colors:
+        for name in ("quats", "shN"):
+            if name in offsets:
+                offsets[name].zero_()
+        return
+    axes = torch.eye(4, dtype=torch.float64)
+    change = multiply_quats(moved.turn.expand(4, 4), axes) - axes
+    offsets["quats"].copy_(rows[:, slices["quats"]] @ change.float())
+    if "shN" in offsets:
+        by_band = torch.kron(moved.bands - torch.eye(bands // 3, dtype=torch.float64), torch.eye(3)).float()
+        shN = rows[:, slices["shN"]]
+        for degree in range(1, math.isqrt(bands // 3 + 1)):  # bands do not mix
+            band = slice(3 * (degree**2 - 1), 3 * ((degree + 1) ** 2 - 1))
+            offsets["shN"][:, band] = shN[:, band] @ by_band[band, band].T
 
 
 def has_kernels() -> bool:

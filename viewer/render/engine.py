@@ -24,6 +24,7 @@ from progdf.compose.layers import DEFAULT_BLEND, Gains, Layer
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.gdf.motions import PartMotions
 from progdf.rasterize.screen import draw_lines_behind
 from progdf.scene.bounds import near_plane
 from viewer.camera.view_camera import Vec3, bounds_of, first_camera, half_camera, to_camera
@@ -225,9 +226,9 @@ class ViewEngine:
         self._picture = None
         self.version += 1
 
-    def touch(self, gdf: Gdf) -> None:
-        """Draw an edit in progress again, whose offsets were written in place."""
-        self.composer.touch(gdf)
+    def touch(self, gdf: Gdf, motions: PartMotions | None = None) -> None:
+        """Draw an edit in progress again, whose offsets were written in place, see `Composer.touch`."""
+        self.composer.touch(gdf, motions)
         self._edits = replace(self._edits, version=self.version)
         self._picture = None
         self.version += 1

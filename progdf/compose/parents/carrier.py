@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from progdf.field.baked import find_segment
 from progdf.field.stored_bases import StoredBases
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
-from progdf.gdf.motions import LinearMap
+from progdf.gdf.motions import LinearMap, PartMotions
 from progdf.system.equality import equal_fields
 
 from .rows import MOVED, Anchored, anchored_rows, carry_added, carry_members, is_move, part_maps
@@ -61,6 +61,11 @@ class Carrier:
         self._now = {name: self.tensors.get(name, getattr(scene, name)).flatten(1) for name in MOVED}
         self._moves = {edit: _find_move(gdf, gdfs) for edit, gdf in enumerate(gdfs) if is_move(gdf)}
         self._is_affected = np.zeros(len(scene), bool)
+
+    def set_motions(self, edit: int, motions: PartMotions) -> None:
+        """Set the motions of an edit in progress, which had others before."""
+        move = self._moves[edit]
+        self._moves[edit] = replace(move, gdf=replace(move.gdf, motions=motions))
 
     def carry(
         self,

@@ -14,13 +14,23 @@ from progdf.compose.added import extend
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf
 from progdf.pull.course import Handle, pull
 from progdf.pull.grips import MAX_GRIP_POINTS, connected_rows, grip_points, with_grips
-from progdf.pull.live import HandlePose, LivePull, edit_in_progress, has_kernels, warm_up, write_offsets
+from progdf.pull.live import (
+    HandlePose,
+    LivePull,
+    edit_in_progress,
+    has_kernels,
+    warm_up,
+    write_move,
+    write_offsets,
+)
+from progdf.quaternions import rotation_matrices
 from progdf.rasterize.cpu import compilation
 from progdf.region import Region, whole_scene
+from progdf.similarity import affine_motion, transform_rows
 from progdf.tidy import Step, similarity, tidy
 from tests.helpers.edits import painted
 from tests.helpers.scenes import random_gaussians
@@ -209,3 +219,32 @@ def test_warm_up_marks_the_kernels_as_compiled(monkeypatch: pytest.MonkeyPatch, 
     assert not has_kernels()
     warm_up()
     assert has_kernels()
+
+
+_TURN = rotation_matrices(torch.tensor([[0.5, 0.5, -0.5, 0.5]], dtype=torch.float64))[0]
+_MOVES = {
+    "shift": torch.eye(3),
+    "turn": _TURN,
+    "turn and scale": 1.5 * _TURN,
+    "stretch": torch.diag(torch.tensor([1.0, 2.0, 0.5])),
+    "mirror": torch.diag(torch.tensor([-1.0, 1.0, 1.0])),
+}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("name", _MOVES)
+def test_move_in_progress_equals_the_moved_rows(name: str, degree: int) -> None:
+    random = torch.Generator().manual_seed(0)
+    shN = torch.randn(50, (degree + 1) ** 2 - 1, 3, generator=random)
+    scene = replace(random_gaussians(80)[torch.arange(50)], shN=shN)
+    members = np.arange(10, 40)
+    rows = pack(scene[torch.from_numpy(members)], with_shN=degree > 0)
+    edit = edit_in_progress(scene, members, rows.shape[1], "moved")
+    pivot = torch.tensor([0.1, -0.2, 0.3])
+    turned = affine_motion(_TURN @ _TURN, torch.ones(3), pivot)
+    motion = affine_motion(_MOVES[name], torch.tensor([3.0, -2.0, 0.5]), pivot)
+    write_move(edit, rows, turned)  # a later move leaves nothing of an earlier one
+    write_move(edit, rows, motion)
+    moved = compose_layers(scene, [Layer(edit)])[torch.from_numpy(members)]
+    expected = transform_rows(rows.double(), motion)
+    torch.testing.assert_close(pack(moved, with_shN=degree > 0).double(), expected, rtol=1e-5, atol=1e-5)

@@ -9,8 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from progdf.compose.layer_paint import layer_of
+from progdf.compose.layers import Layer
+from progdf.compose.reference import compose_layers
 from progdf.formats.ply import load_ply
+from progdf.gaussians import Gaussians
+from progdf.quaternions import rotation_matrices
+from progdf.region import whole_scene
+from progdf.similarity import affine_motion
+from progdf.tidy import Step, tidy
 from tests.helpers.edits import bits
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import opened_document
@@ -21,6 +30,7 @@ from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.commands import Plain
+from viewer.state.transient import Gizmo
 from viewer.state.workspace import with_transient
 
 pytestmark = pytest.mark.gl
@@ -83,6 +93,45 @@ def test_moved_selection_follows_the_gizmo_and_can_be_canceled(app: App) -> None
     assert app.main_view.work.view.layers[-1].name == "moved", (
         "nothing was moved, so there is no second layer"
     )
+
+
+@pytest.mark.parametrize("stretch", [1.0, 1.7])
+def test_dragged_move_under_layers_is_composed_in_place_and_exact(app: App, stretch: float) -> None:
+    view = app.main_view.work.view
+    strong = replace(view, layers=tuple(replace(layer, strength=0.7) for layer in view.layers))
+    app.main_view.store.change(strong)
+    press(app, "Ctrl+A", "Alt+M")
+    gizmo = app.main_view.work.transient.gizmo
+    assert isinstance(gizmo, Gizmo)
+    engines = []
+    for angle in (0.2, 0.5):
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_rotvec((0.0, angle, 0.1)).as_matrix() @ np.diag((1.0, stretch, 1.0))
+        matrix[:3, 3] = angle, 0.25, -0.125
+        app.main_view.store.replace(
+            with_transient(app.main_view.work, gizmo=replace(gizmo, matrix=matrix, shown=matrix))
+        )
+        app.main_view.messages.request(Plain("place"))
+        app.draw()
+        app.draw()
+        engines.append(app.engine)
+    assert engines[0] is engines[1], "only the moved Gaussians are composed again"
+    region = whole_scene(bear().scene)
+    center = torch.tensor(gizmo.center, dtype=torch.float64)
+    motion = affine_motion(torch.tensor(matrix[:3, :3]), torch.tensor(matrix[:3, 3]), center)
+    moved = tidy(app.documents.get().original, [Step("transform", region, motion)], "moved", only_end=True)
+    document = app.documents.get()
+    layers = [layer_of(document.gdfs[l.gdf], l.strength, l.gains, l.paint, l.blend) for l in strong.layers]
+    expected = compose_layers(document.scene, [*layers, Layer(moved)], strong.blend)
+    drawn = app.engine.gaussians(app.main_view._displayed_view())
+    torch.testing.assert_close(drawn.means, expected.means, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(_covariances(drawn), _covariances(expected), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(drawn.sh, expected.sh, rtol=1e-4, atol=1e-4)
+
+
+def _covariances(scene: Gaussians) -> torch.Tensor:
+    axes = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :]
+    return axes @ axes.mT
 
 
 def test_copy_has_rows_that_are_counted_selected_saved_and_exported(

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from progdf.compose.added import rows_on
 from progdf.compose.layer_paint import layer_of
@@ -18,12 +19,13 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf, save_gdf
-from progdf.pull.live import edit_in_progress, write_offsets
+from progdf.gdf.motions import PartMotions
+from progdf.pull.live import edit_in_progress, write_move
 from progdf.region import Region, from_mask
 from progdf.scene.subject import ground_height
 from progdf.similarity import AffineMotion, affine_motion
 from progdf.system.equality import equal_fields
-from progdf.tidy import Step, tidy
+from progdf.tidy import Step, leave_paint, tidy
 from viewer.app.messages import Requests
 from viewer.app.parts.making import LayerMaker, Progress
 from viewer.camera.view_camera import Vec3
@@ -164,7 +166,9 @@ class TidyActions:
         self._documents = documents
         self._maker = maker
         self._selected: _Selected | None = None  # the Gaussians being moved or copied
-        self._live: Gdf | None = None  # preview of a move whose offsets can be written in place
+        self._live: Gdf | None = None  # preview of a move, whose offsets are written in place
+        # scene of the preview, and its members before the move, packed. [M,C]
+        self._rows: tuple[Gaussians, Tensor] | None = None
 
     @property
     def requests(self) -> Requests:
@@ -180,7 +184,7 @@ class TidyActions:
 
     def leave_scene(self) -> None:
         """Drop the handles and measured points when another scene opens."""
-        self._selected = self._live = None
+        self._selected = self._live = self._rows = None
         self._store.replace(with_transient(self._store.get(), gizmo=None, measure=None))
 
     def _begin(self, does: str) -> None:
@@ -202,6 +206,7 @@ class TidyActions:
             raise ProgdfError("the layers hide everything that is selected; make it visible to copy it")
         center = moved.means.double().mean(dim=0)
         self._selected = selected
+        self._live = self._rows = None
         at = (float(center[0]), float(center[1]), float(center[2]))
         part = _placed_part(moved, document, selected.region, self._store.get().view.camera.up)
         self._set_gizmo(Gizmo(kind, at, np.eye(4), part=part))
@@ -233,24 +238,28 @@ class TidyActions:
         return [Step(gizmo.does, selected.region, _motion(gizmo), copied)]
 
     def _place(self, _: None) -> None:
-        """Show the moved selection at the position of the handles."""
+        """Show the moved or copied selection at the position of the handles."""
         if steps := self._steps():
             document = self._documents.get()
-            if steps[0].does == "transform" and not visible_layers(self._store.get().view):
-                self._place_alone(document, steps[0])
+            if steps[0].does == "transform":
+                self._place_moved(document, steps[0])
                 return
-            leaves_paint = self._selected is not None and self._selected.leaves_paint
-            name = _NAMES[steps[0].does]
-            gdf = tidy(document.original, steps, name, leaves_paint=leaves_paint, only_end=True)
+            gdf = tidy(document.original, steps, _NAMES["duplicate"], only_end=True)
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._documents.replace(document, (gdf,), live)
 
-    def _place_alone(self, document: Document, step: Step) -> None:
-        """Show the moved selection of a scene without visible layers; only its offsets are written again."""
+    def _place_moved(self, document: Document, step: Step) -> None:
+        """Show the moved selection. After the first time, only its own Gaussians are composed again."""
         scene = document.original
         members = step.region.members
-        rows = pack(scene[members], with_shN=scene.sh_degree > 0)
-        offsets = step.move(rows.double(), 1.0).to(rows.dtype) - rows
+        motion = step.motion
+        assert motion is not None, "a move has a motion"
+        if self._rows is None or self._rows[0] is not scene:
+            self._rows = scene, pack(scene[members], with_shN=scene.sh_degree > 0).float()
+        rows = self._rows[1]
+        motions = None  # without layers below, offsets alone do, in a third of the time
+        if visible_layers(self._store.get().view):
+            motions = PartMotions(torch.zeros(len(members), dtype=torch.int64), ((motion,),))
         live = self._live
         engine = None if self._engine is None else self._engine()
         is_drawn = (
@@ -259,14 +268,18 @@ class TidyActions:
             and len(engine.gdfs) > 0
             and engine.gdfs[-1].field is live.field
             and torch.equal(live.region.members, members)
+            and (live.motions is None) == (motions is None)
         )
         if live is not None and engine is not None and is_drawn:
-            write_offsets(live, offsets)
-            engine.touch(engine.gdfs[-1])
+            write_move(live, rows, motion)
+            engine.touch(engine.gdfs[-1], motions)
             self._store.wake()
             return
         gdf = edit_in_progress(scene, members.numpy(), rows.shape[1], _NAMES[step.does])
-        write_offsets(gdf, offsets)
+        gdf = replace(gdf, motions=motions)
+        if self._selected is not None and self._selected.leaves_paint:
+            gdf = leave_paint(gdf)
+        write_move(gdf, rows, motion)
         self._documents.replace(document, (gdf,), (LayerState(len(document.edits), gdf.name, 1.0),))
         self._live = gdf
 
@@ -287,7 +300,7 @@ class TidyActions:
             self._documents.replace(self._documents.get())
 
     def _end(self) -> None:
-        self._selected = self._live = None
+        self._selected = self._live = self._rows = None
         self._set_gizmo(None)
         self._store.wake()
 
