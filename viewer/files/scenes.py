@@ -20,7 +20,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin, concatenate
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.gdf.placed import Placement, Target, carry_edit, place_scene
+from progdf.gdf.placed import Placement, Target, carry_edit, check_rounding, place_scene
 from progdf.io.atomic import numbered_names
 from viewer.state.selection import SelectionState, take_rows
 from viewer.state.view_state import MAX_SCENES, SceneState, ViewState
@@ -96,6 +96,9 @@ def merge(files: Sequence[SceneFile], states: Sequence[SceneState]) -> Gaussians
     """Return the merged scene, relative to the origin of the first one.
 
     Scenes with a lower SH degree get bands of zeros.
+
+    Raises:
+        ProgdfError: a scene is placed too far away, see `check_rounding`.
     """
     first = files[0].gaussians
     bands = max(file.gaussians.shN.shape[1] for file in files)
@@ -103,6 +106,8 @@ def merge(files: Sequence[SceneFile], states: Sequence[SceneState]) -> Gaussians
     for scene, file in enumerate(files):
         state = state_of(states, scene)
         part = place_scene(file.gaussians, state.placement, first.origin, bands)
+        if state.placement != Placement():
+            check_rounding(part, state.name)
         if not state.visible:
             part = replace(part, logit_opacities=torch.full_like(part.logit_opacities, HIDDEN_LOGIT))
         parts.append(part)

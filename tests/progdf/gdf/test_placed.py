@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
+from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.gdf.placed import Placement, Target, carry_edit, place_scene
+from progdf.gdf.placed import Placement, Target, carry_edit, check_rounding, place_scene
+from progdf.metrics.image import psnr
+from progdf.rasterize.engines import render
 from progdf.region import from_mask
+from progdf.scene.orbit_rig import orbit_rig
 from progdf.similarity import AffineMotion, affine_motion, transform_rows
 from progdf.tidy import Step, tidy
 from tests.helpers.draws import Draws
@@ -114,3 +120,23 @@ def test_mirrored_part_refuses_a_turn_of_its_scene() -> None:
     assert carried(edit, scene, Placement((1.0, 0.0, 0.0), factor=2.0)).motions is not None
     with pytest.raises(ProgdfError, match="mirrors a part"):
         carried(edit, scene, PLACED)
+
+
+def test_scene_far_from_the_origin_looks_the_same_or_is_refused() -> None:
+    scene = bear(3000).gaussians
+    camera = orbit_rig(scene, 1, 96, 96)[0]
+    near = render(scene, camera, torch.zeros(3)).image
+    sizes = scene.scales.median(dim=1).values
+    limit = float(sizes.median())
+    for power in range(2, 9):
+        shift = 10.0**power
+        placed = place_scene(scene, Placement(shift=(shift, 0.0, 0.0)), ZERO, scene.shN.shape[1])
+        if np.spacing(np.float32(shift)) > limit:
+            with pytest.raises(ProgdfError, match="place it nearer"):
+                check_rounding(placed, "bear")
+            continue
+        check_rounding(placed, "bear")
+        viewmat = camera.viewmat.double()
+        viewmat[:3, 3] -= shift * viewmat[:3, 0]
+        far = render(placed, replace(camera, viewmat=viewmat.to(camera.viewmat)), torch.zeros(3)).image
+        assert psnr(far.clamp(0, 1).double(), near.clamp(0, 1).double()) > 45.0

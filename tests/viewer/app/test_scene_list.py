@@ -12,6 +12,7 @@ import torch
 
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import fingerprint, read_gdf
+from progdf.gdf.placed import Placement
 from tests.helpers.null_app import null_app, press
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import opened_document
@@ -93,6 +94,21 @@ def test_moved_scene_is_placed_without_a_layer(app: App) -> None:
     assert torch.allclose(moved - before, torch.tensor([0.5, 0.25, -0.125]), atol=1e-5)
     press(app, "Ctrl+Z")
     assert torch.equal(cloud(app), before)
+
+
+def test_scene_cannot_be_placed_where_positions_are_coarse(app: App) -> None:
+    app.handle(OnItem("move_scene", 1))
+    app.draw()
+    gizmo = app.store.get().transient.gizmo
+    assert isinstance(gizmo, Gizmo)
+    matrix = np.eye(4)
+    matrix[0, 3] = 1e8
+    app.store.replace(with_transient(app.store.get(), gizmo=replace(gizmo, matrix=matrix)))
+    press(app, "Enter")
+    message = app.store.get().message
+    assert message is not None
+    assert "place it nearer" in message.text
+    assert app.store.get().view.scenes[1].placement == Placement()
 
 
 def test_edit_of_a_scene_is_bound_to_its_file_and_follows_it(app: App, folder: Path) -> None:
