@@ -67,7 +67,8 @@ _HELPS = {
     "tint": "From green to magenta light",
     "vibrance": "Chroma of weak colors",
     "saturation": "−1 is gray, 1 doubles the chroma",
-    "clarity": "Local contrast: −1 smooths, 1 doubles it; not part of .cube files",
+    "clarity": """Local contrast: −1 smooths, 1 doubles it; not part of .cube files.
+The picture shows it now. The layer appears when training has ended""",
     "balance": "−1: more tones are highlights; 1: more are shadows",
 }
 _LIGHT = ("exposure", "contrast", "highlights", "shadows", "whites", "blacks", "clarity")
