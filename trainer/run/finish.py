@@ -557,7 +557,7 @@ def _finish_again(run: FinishedRun, quiet: bool, request: ReportRequest) -> RunR
     """Fit the field of a finished run by its record, and write the edit and its report."""
     log = RunLog(run.folder.log, quiet, refits=True)
     try:
-        with log.stage("views"):
+        with log.stage("views"), log.steps("views", 1):
             setup = render_edited_views(run)
         perceptual, warning = perceptual_loss()
         if warning:

@@ -41,7 +41,8 @@ from .finish import DEFAULTS, FULL_REPORT, ReportRequest, RunResult, differences
 
 _TOLERANCE = 0.05  # color tolerance of equal pixels; also the mask value from which a pixel counts as region
 _MIN_PAINT = 2 / 255  # smallest color change that counts as paint
-_LOOKS_PER_VIEW = 9  # estimated renders of each view while a hole is filled, for the progress
+_LOOKS_PER_VIEW = 6  # estimated renders of each view while a hole is filled, for the progress
+_TEXTURE_WORK = 4.0  # estimated work of a textured fill, relative to choosing the views
 _JUDGED_STRENGTHS = (0.25, 0.5, 0.75, 0.9)  # strengths at which the visible change is measured
 
 
@@ -124,7 +125,7 @@ def remove_region(
     """
     scene = setup.scene
     named = setup.region
-    log.expect({"fill": 2.0, "measure the edit": 1.0})
+    log.expect({"views": 1.0, "fill": 1.0, "texture": _TEXTURE_WORK})
     with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
@@ -136,9 +137,11 @@ def remove_region(
             close = partial(fill_holes, pictures=fill_pictures, close=kind != "none", looked=looked)
             attempt = partial(_attempt, scene, views=views, depths=depths, close=close, looked=looked)
             removal = _remove_whole(scene, named, around.train, attempt, log)
-            if kind == "surface" and removal.fill.rows is not None:
-                removal = replace(removal, fill=close(removal.opened, is_textured=True))
         fill = removal.fill
+        if kind == "surface" and fill.rows is not None:
+            with log.steps("texture", 1):
+                fill = fill_holes(removal.opened, is_textured=True)
+            removal = replace(removal, fill=fill)
         for note in fill.notes:
             log.say(note)
         removed = removal.scene

@@ -128,7 +128,7 @@ def _prepare_views(
     _, warning = perceptual_loss()
     if warning:
         log.say(warning)
-    with log.stage("views"):
+    with log.stage("views"), log.steps("views", 1):
         setup = _render_originals(options, scene, region, folder, shared)
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:

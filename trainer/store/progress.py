@@ -25,8 +25,9 @@ Advance = Callable[[int, str], None]
 """Callback with the number of finished steps and a short status text (the loss)."""
 
 STAGES = {
-    "views": "",
+    "views": "Choosing the views",
     "fill": "Filling the hole",
+    "texture": "Continuing the texture around the hole",
     "try kinds": "Choosing the kind of edit",
     "edit": "Editing views",
     "weights": "",

@@ -231,6 +231,8 @@ def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path, monkeypatch:
     assert len(set(shares)) > 36, "three looks at each of 12 views"
     assert shares == sorted(shares)
     assert max(shares) < 1.0
+    named = list(dict.fromkeys(label for label, _ in steps))
+    assert named[:3] == ["Choosing the views", "Filling the hole", "Continuing the texture around the hole"]
     scene = load_ply(scene_file)
     gdf = load_gdf(result.gdf, scene)
     report = json.loads((out / "report.json").read_text())

@@ -73,7 +73,7 @@ def test_remaining_time_is_within_a_factor_of_two(
     takes = {stage: pace * work * (1.6 if stage == long else 1.0) for stage, work in WORK.items()}
     end = now + sum(takes.values())
     worst = 1.0
-    with log.stage("views"):
+    with log.stage("views"), log.steps("views", 1):
         now += takes["views"]
     for stage in ("edit", "optimize", "measure the edit"):
         begun = now
@@ -85,6 +85,14 @@ def test_remaining_time_is_within_a_factor_of_two(
             now = begun + takes[stage]
     log.close()
     assert worst < 2.0
+
+
+def test_every_stage_is_named_before_its_first_step(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", quiet=True, progress=tmp_path / "progress.json")
+    with log.steps("views", 1):
+        state = json.loads((tmp_path / "progress.json").read_text("utf-8"))
+    log.close()
+    assert (state["label"], state["count"], state["share"]) == ("Choosing the views", "", 0.0)
 
 
 def test_stage_that_edits_views_names_the_awaited_picture(tmp_path: Path) -> None:
