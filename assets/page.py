@@ -48,7 +48,7 @@ def main(demo: Path, out: Path) -> None:
 def take(
     browser: Any, page: Path, strengths: dict[str, float], to: Path, width: int, height: int, touch: bool
 ) -> Image.Image:
-    """Take a screenshot with the sliders set, light at desktop size and dark at phone size."""
+    """Take a screenshot with the sliders set; the browser prefers dark at phone size."""
     tab = browser.new_page(
         viewport={"width": width, "height": height},
         has_touch=touch,

@@ -14,6 +14,7 @@ PAGES = {
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
     "assets/scenes/CREDITS.md": "scenes.md",
+    "trainer/evaluate/suite/captures/CREDITS.md": "captures.md",
 }
 """Page of the repository → its name in the site."""
 
