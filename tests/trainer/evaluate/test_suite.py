@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import sliders
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
@@ -192,6 +193,11 @@ def test_results_are_read_back_from_their_file(tmp_path: Path) -> None:
     assert rest["version"] == 1
     cells = [list(row.values())[:-1] for row in summary_rows(read, "lpips")]  # the last are seconds
     assert cells == [list(row.values())[:-1] for row in summary_rows(written, "lpips")]
+    by_method, by_edit = sliders.tables([tmp_path])
+    assert [row[0] for row in by_method.rows] == ["original", "cross-fade"]
+    assert [row[0] for row in by_edit.rows] == ["blue scarf"]
+    with pytest.raises(ProgdfError, match="name one folder"):
+        sliders.tables()
     (tmp_path / "sliders.json").write_text("{}")
     with pytest.raises(ProgdfError, match="is damaged"):
         read_results(tmp_path / "sliders.json")
