@@ -26,6 +26,15 @@ def test_version_is_the_same_in_every_file() -> None:
     assert first[1] == __version__
 
 
+@pytest.mark.parametrize("name", ["ci.yml", "release.yml"])
+def test_workflows_install_everything_that_builds(name: str) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    needed = {re.split("[<>=]", line)[0] for line in project["build-system"]["requires"]}
+    workflow = (ROOT / ".github" / "workflows" / name).read_text(encoding="utf-8")
+    (line,) = (line for line in workflow.splitlines() if "pip install" in line and "hatchling" in line)
+    assert needed <= set(line.split())
+
+
 @pytest.mark.parametrize(
     ("wheel", "systems"),
     [
