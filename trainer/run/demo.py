@@ -292,7 +292,10 @@ def _train_options(options: DemoOptions, show: DemoPlan, scene: DemoScene, edit:
         scene=folder / "scene.ply",
         out=folder / edit.name,
         region=RegionOptions("changed" if painted else f"labels:{folder / 'labels.npy'}:{ids}"),
-        editor=EditorOptions(f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor),
+        editor=EditorOptions(
+            f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor,
+            carry_on="always" if painted else "auto",  # a panda all around, not from the front alone
+        ),
         views=TrainingViewOptions(
             cameras=folder / "cameras.json" if show.inside else None,
             views=effort.views,

@@ -231,8 +231,9 @@ def describe_loaded(gdf: Gdf) -> str:
 
     A grade applied to another region omits parts. Added rows of an older file get anchors.
     """
-    if gdf.anchors_found:
-        rows = format_count(gdf.members - len(gdf.region), "added Gaussian")
+    added = gdf.members - len(gdf.region)
+    if gdf.anchors_found and added:
+        rows = format_count(added, "added Gaussian")
         return f"{gdf.name}: its file has no anchors, so its {rows} follow the nearest surface"
     parts = gdf.report.get("left_out") if gdf.applied else ""
     left_out = f"without its {parts}, which fits only the scene it was trained on"

@@ -31,6 +31,7 @@ from tests.helpers.draws import Draws
 from tests.helpers.edits import added_rows, bits, curved_field, edit_of, growing, painted, some_rows
 from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.scenes import random_gaussians
+from viewer.state.facts import describe_loaded
 
 COUNT = 300
 DISCS = 25
@@ -278,6 +279,9 @@ def test_anchors_are_saved_and_older_files_get_them_on_load(
     assert found.anchors is not None
     assert torch.equal(found.anchors.rows, logo.anchors.rows)
     assert found.anchors.pushes
+    assert "added Gaussian" in describe_loaded(found)
+    recolored = edit_of(scene, some_rows(scene, 90, 2), curved_field(90, 2))
+    assert describe_loaded(replace(recolored, anchors_found=True)) == ""
     path.write_bytes(signed_gdf({**old, "format": 7, "report": {}}, kept))
     assert load_gdf(path, scene).anchors is None, "an edit without a report is a copy"
 

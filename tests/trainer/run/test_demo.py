@@ -76,6 +76,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
         else:
             (picture,) = plan.views.pictures
             assert plan.region.region == "changed"
+            assert plan.editor.carry_on == "always"
             assert torch.equal(find_picture_camera(picture).viewmat, bear.cameras[2].viewmat)
         out.mkdir()
         save_gdf(out / f"{edit.name}.gdf", _edit(out.parent, bear, edit))
