@@ -87,7 +87,8 @@ pictures: setup extras window browser
 	$(BIN)/python assets/tour.py select $(BEAR)/bear.compressed.ply $(BEAR)/panda.gdf $(BEAR)/scarf.gdf -o assets/tour/select.png
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/progdf evaluate --suite sliders runs/sliders --threads 1
-	cp runs/sliders/sliders.png assets/
+	$(BIN)/python -c "from PIL import Image; \
+	  Image.open('runs/sliders/sliders.png').convert('RGB').save('assets/sliders.jpg', quality=85, optimize=True)"
 	$(BIN)/python -m benchmarks sliders --runs runs/sliders --markdown docs/benchmarks.md
 	$(BIN)/python assets/figures.py
 	$(BIN)/python assets/architecture.py
