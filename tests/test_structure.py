@@ -24,8 +24,8 @@ PACKAGES = ("progdf", "trainer", "viewer", "benchmarks")
 
 # Modules that a package must not import. Only progdf ← trainer and progdf ← viewer are allowed.
 FORBIDDEN = {
-    "progdf": {"trainer", "viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle"},
-    "trainer": {"viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle"},
+    "progdf": {"trainer", "viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
+    "trainer": {"viewer", "shaders", "benchmarks", "moderngl", "glfw", "imgui_bundle", "pyrr"},
     "viewer": {"trainer", "benchmarks", "diffusers", "transformers"},
 }
 ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # its table of commands names all packages

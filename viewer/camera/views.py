@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -11,6 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .view_camera import Vec3, ViewCamera, axes, dot, look_along
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", SyntaxWarning)  # of a docstring of pyrr, since Python 3.12
+    from pyrr import matrix33, quaternion
+
+_SAME_ORIENTATION = 1e-6  # radians; below, the sines are as their angles
 
 EASINGS = ("smooth", "linear", "hold")
 """Interpolations between keys.
@@ -96,18 +103,28 @@ def unwrap(degrees: Sequence[float]) -> list[float]:
 
 
 def _slerp(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float) -> ViewCamera:
-    """Return `placed` with the interpolated orientation of two cameras. Its up axis is the picture's up."""
-    from scipy.spatial.transform import Rotation, Slerp  # takes 0.5 s to import; few films need it
+    """Return `placed` with the interpolated orientation of two cameras. Its up axis is the picture's up.
 
-    path = Slerp([0.0, 1.0], Rotation.from_matrix([_picture_axes(here), _picture_axes(there)]))
-    _, up, back = path(share).as_matrix()
+    pyrr's own slerp does half of a turn of 20° after a quarter of the way.
+    """
+    start, end = _orientation(here), _orientation(there)
+    cosine = float(start @ end)
+    angle = math.acos(min(1.0, abs(cosine)))
+    shares = np.array([1.0 - share, share])
+    if angle > _SAME_ORIENTATION:
+        shares = np.sin(shares * angle)
+    # q and −q are the same orientation; the nearer one takes the shorter way
+    between = shares[0] * start + math.copysign(shares[1], cosine) * end
+    _, up, back = matrix33.create_from_quaternion(quaternion.normalize(between))
     return look_along(replace(placed, up=_vec3(up)), _vec3(back))
 
 
-def _picture_axes(camera: ViewCamera) -> NDArray[np.float64]:
-    """Return the picture's axes right, up and back as rows. [3,3]"""
+def _orientation(camera: ViewCamera) -> NDArray[np.float64]:
+    """Return the picture's axes as a unit quaternion, xyzw as in pyrr. [4]"""
     picture = axes(camera)
-    return np.array([picture.right, picture.up, picture.back], dtype=np.float64)
+    rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
+    orientation: NDArray[np.float64] = quaternion.normalize(quaternion.create_from_matrix(rows))
+    return orientation
 
 
 def _vec3(row: NDArray[np.float64]) -> Vec3:

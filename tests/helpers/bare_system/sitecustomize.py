@@ -47,7 +47,7 @@ BEFORE = (
         "plyfile",
         "safetensors.torch",
     ),
-    *("msgspec", "platformdirs", "filelock", "moderngl", "glfw", "imgui_bundle", "tyro", "rich.live"),
+    *("msgspec", "platformdirs", "filelock", "moderngl", "glfw", "imgui_bundle", "pyrr", "tyro", "rich.live"),
     *(
         "rich.console",
         "rich.progress",
