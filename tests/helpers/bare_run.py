@@ -64,13 +64,13 @@ def jobs() -> None:
 
     queue = JobQueue()
     number = queue.add(order("blue"))
-    assert wait("Editing views") == "Editing views"
+    assert wait("Waiting for picture") == "Waiting for picture"
     queue.stop(number)
     assert (status := wait()) == "stopped", status
     queue.resume(number)
     assert (status := wait()) == "done", status
     queue.add(order("red"))
-    assert wait("Editing views") == "Editing views"
+    assert wait("Waiting for picture") == "Waiting for picture"
     (child,) = queue._children.values()
     child.kill()
     assert wait().startswith("failed")

@@ -228,7 +228,8 @@ def test_removal_is_a_regular_run(scene_file: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr("trainer.store.progress._FILE_INTERVAL_S", 0.0)
     result = train(options_of(scene_file, out), quiet=True)
     shares = [share for label, share in steps if label == "Filling the hole"]
-    assert len(set(shares)) > 36, "three looks at each of 12 views"
+    assert len(shares) > 36, "three looks at each of 12 views"  # equal while less time is left than foreseen
+    assert shares[-1] > shares[0]
     assert shares == sorted(shares)
     assert max(shares) < 1.0
     named = list(dict.fromkeys(label for label, _ in steps))

@@ -164,7 +164,8 @@ class Page {
   // Draws a frame, at a share of its width and height that the device draws in time if none is given.
   #draw(now, share = null) {
     if (share === null) this.pending = null;
-    if (!this.canvas.clientWidth) return;  // hidden, for example while a notebook changes its theme, until `resize`
+    // hidden, for example while a notebook changes its theme: its size may be the same afterwards
+    if (!this.canvas.clientWidth) return void (this.resting = setTimeout(() => this.request(), REST_MS));
     this.again = share === null && this.drawing;
     if (this.again) return;
     this.#advance(now);
