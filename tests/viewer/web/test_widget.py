@@ -82,13 +82,10 @@ class Cells:
         for _ in range(count):
             self.tab.evaluate("new Promise(requestAnimationFrame)")
 
-    def rest(self) -> None:
+    def rest(self, view: int = 0) -> None:
         """Wait until the picture is drawn at full resolution, which happens once it stops moving."""
-        before = None
-        while before is None or (self.picture() != before).any():
-            before = self.picture()
-            self.tab.wait_for_timeout(250)
-            self.frames()
+        self.frames()
+        self.tab.wait_for_function(f"views[{view}].canvas.closest('.page').classList.contains('sharp')")
 
     def model(self, values: str, view: int = 0) -> Any:
         return self.tab.evaluate(f"views[{view}].model.{values}")
@@ -96,9 +93,10 @@ class Cells:
     def receive(self, name: str, value: Any, view: int = 0) -> None:
         """Set a model value as if it arrived from Python."""
         self.tab.evaluate(f"([name, value]) => views[{view}].model.receive(name, value)", [name, value])
-        self.rest() if name == "camera" else self.frames()
+        self.rest(view)
 
     def picture(self, view: int = 0) -> np.ndarray:
+        self.rest(view)
         address = self.tab.evaluate(f"views[{view}].canvas.toDataURL()")
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB"))
 

@@ -131,6 +131,7 @@ class Page {
   }
 
   request() {
+    this.root.classList.remove("sharp");
     this.pending ??= requestAnimationFrame((now) => this.#draw(now));
   }
 
@@ -167,7 +168,7 @@ class Page {
     // hidden, for example while a notebook changes its theme: its size may be the same afterwards
     if (!this.canvas.clientWidth) return void (this.resting = setTimeout(() => this.request(), REST_MS));
     this.again = share === null && this.drawing;
-    if (this.again) return;
+    if (this.again) return this.shown?.();  // the picture is late, but not the values
     this.#advance(now);
     if (this.dirty) this.#compose();
     const at = this.#pinhole(), row = depthRow(at);
@@ -213,6 +214,7 @@ class Page {
     this.times[share === 1 ? "sharp" : "coarse"] = performance.now() - start;
     if (share === 1 || this.movedAt) this.root.classList.add("drawn");  // the still is sharp until then
     if (this.again || this.times.sharp === undefined) this.request();
+    else if (share === 1 && !this.pending) this.root.classList.add("sharp");  // until the next change
   }
 
   #advance(now) {
