@@ -167,15 +167,12 @@ class Page {
     if (share === null) this.pending = null;
     // hidden, for example while a notebook changes its theme: its size may be the same afterwards
     if (!this.canvas.clientWidth) return void (this.resting = setTimeout(() => this.request(), REST_MS));
-    this.again = share === null && this.drawing;
-    if (this.again) return this.shown?.();  // the picture is late, but not the values
+    if ((this.again = share === null && this.drawing)) return this.shown?.();  // the picture is late, not the values
     this.#advance(now);
     if (this.dirty) this.#compose();
     const at = this.#pinhole(), row = depthRow(at);
     if (this.turned || this.sorted?.some((x, i) => x !== row[i]) !== false) {
-      this.sorted = row;
-      this.turned = false;
-      this.sorting = true;
+      Object.assign(this, { sorted: row, turned: false, sorting: true });
       this.sorter.sort(row);
       this.sorting = false;
     }
