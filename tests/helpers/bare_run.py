@@ -52,28 +52,31 @@ def jobs() -> None:
         out = training.free_run(training.edits_folder(Path("bear.ply")), name)
         return EditOrder(Path("bear.ply"), out, name, EARS, "tint:#3060d0", quick=True, threads=1)
 
-    def wait(until: str = "") -> str:
-        """Wait until the job ends, or until its state is `until`. Return its state."""
-        while queue.busy():
+    def wait_for_end() -> str:
+        """Wait until a job ends. Return its status and its error."""
+        while True:
             for ended in queue.poll():
                 return ended.status + ended.error
-            if until and any(job.progress.label == until for job in queue.jobs):
-                break
             time.sleep(0.05)
-        return until
+
+    def wait_for_pictures() -> None:
+        """Wait until the running job has edited a picture. The queue itself reads progress once a second."""
+        while (job := queue.busy(EditOrder)) and job.task.read_progress(job.progress).share == 0.0:
+            assert not queue.poll()
+            time.sleep(0.01)
 
     queue = JobQueue()
     number = queue.add(order("blue"))
-    assert wait("Waiting for picture") == "Waiting for picture"
+    wait_for_pictures()
     queue.stop(number)
-    assert (status := wait()) == "stopped", status
+    assert (status := wait_for_end()) == "stopped", status
     queue.resume(number)
-    assert (status := wait()) == "done", status
+    assert (status := wait_for_end()) == "done", status
     queue.add(order("red"))
-    assert wait("Waiting for picture") == "Waiting for picture"
+    wait_for_pictures()
     (child,) = queue._children.values()
     child.kill()
-    assert wait().startswith("failed")
+    assert wait_for_end().startswith("failed")
     queue.close()
 
 
