@@ -25,7 +25,15 @@ from progdf.io.json_values import convert_json, to_json
 
 from .camera.view_camera import LARGEST_SIDE, ViewCamera, first_camera
 from .files.document import Document
-from .files.web_page import PageOptions, camera_json, first_state, picture, write_page
+from .files.web_page import (
+    PAGE_ASPECT,
+    PageOptions,
+    camera_json,
+    first_state,
+    picture,
+    still_picture,
+    write_page,
+)
 from .state.layers import largest_strength
 from .state.view_state import LayerState, ViewState
 from .web.container import pack
@@ -37,7 +45,7 @@ try:
 except ImportError as error:
     raise ProgdfError("viewer.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
 
-_STILL_SIZE = 720, 480  # width and height of the still image, px
+_SNAPSHOT_SIZE = 720, 480  # width and height of the picture where no script runs, px
 
 
 class RefusedError(ProgdfError, traitlets.TraitError):
@@ -122,14 +130,14 @@ class Widget(anywidget.AnyWidget):
             edits = (*edits, replace(layer.gdf, name=name))
         self._document = Document(title or "scene", original, edits)
         view = ViewState(
-            camera=first_camera(original),
+            camera=first_camera(original, aspect=PAGE_ASPECT),
             layers=tuple(_state(i, edits[i].name, layer) for i, layer in enumerate(stack)),
             blend=blend,
             background=background,
             overshoot=any(layer.strength > 1.0 for layer in stack),
         )
         self._view = convert_json(to_json(view), ViewState)  # raises ValueError for numbers out of range
-        still = picture(self._document.scene, self._document.gdfs, self._view, _STILL_SIZE)
+        still = still_picture(self._document.scene, self._document.gdfs, self._view, side=480)
         state, _ = first_state(self._document, self._view)
         super().__init__(
             _markup=PageTexts(title, credit, background, still).markup,
@@ -231,7 +239,7 @@ class Widget(anywidget.AnyWidget):
         """Add a still image for notebook viewers that run no widgets."""
         data, about = super()._repr_mimebundle_(**kwargs)  # type: ignore[misc]
         file = io.BytesIO()
-        self.snapshot(*_STILL_SIZE).save(file, "JPEG", quality=85)
+        self.snapshot(*_SNAPSHOT_SIZE).save(file, "JPEG", quality=85)
         return {**data, "image/jpeg": base64.b64encode(file.getvalue()).decode()}, about
 
 

@@ -17,7 +17,7 @@ from progdf.terminal import format_count, print_line
 from viewer.camera import view_camera
 from viewer.files.edited_scene import compose, describe_loss, save_bundle, save_cube
 from viewer.files.session import WindowSession
-from viewer.files.web_page import PAGE, PageOptions, write_page
+from viewer.files.web_page import PAGE, PAGE_ASPECT, PageOptions, write_page
 from viewer.pictures import film
 from viewer.state import timeline
 from viewer.state.layers import describe_strengths
@@ -48,7 +48,7 @@ def export(argv: Sequence[str]) -> int:
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
     if ending == PAGE:
-        view = _view_of_scene(opened)
+        view = _view_of_scene(opened, PAGE_ASPECT)
         print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
         return 0
     if ending == CUBE:
@@ -73,12 +73,18 @@ def export(argv: Sequence[str]) -> int:
     return 0
 
 
-def _view_of_scene(opened: OpenStack) -> ViewState:
-    """Return the view of a session, else that of its strengths with the first camera of the scene."""
+def _view_of_scene(opened: OpenStack, aspect: float = 1.5) -> ViewState:
+    """Return the view of a session, else that of its strengths with the first camera of the scene.
+
+    Args:
+        opened: the scenes and edits
+        aspect: width / height of the part of the picture that holds the scene's subject
+    """
     if opened.session is not None:
         return opened.view
     document = opened.document
-    camera = view_camera.first_camera(document.framed_scene, up=opened.up, stored=document.stored_camera)
+    stored = document.stored_camera
+    camera = view_camera.first_camera(document.framed_scene, aspect=aspect, up=opened.up, stored=stored)
     return replace(opened.view, camera=camera)
 
 

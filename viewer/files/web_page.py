@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,8 +31,13 @@ from .document import Document
 from .session import WindowSession
 
 PAGE = ".html"  # suffix of a page
-STILL = 1680, 800
-"""Width and height of a page's still image, px. It fills a screen of 16:9, centered beside the panel."""
+PAGE_ASPECT = 1.0  # width / height of the part of the first view that a page shows on every screen
+STILL_SIDE = 800  # side of the square of the first view that a page shows on every screen, px
+STILL_SIDES = (2.1, 1.45)
+"""Width and height of a page's still image in its square's sides; page.css repeats the height.
+
+It fills a screen of 16:9 beside the panel, and a phone above the panel.
+"""
 _EXACT_DB = 99.0  # PSNR from which the error is not reported
 
 
@@ -80,13 +86,13 @@ def write_page(
     stage, edits = first_state(document, view, kept, options)
     gdfs = [document.gdfs[i] for i in edits]
     title = options.title or Path(document.title).stem
-    start = picture(document.scene, document.gdfs, view, STILL)
+    start = still_picture(document.scene, document.gdfs, view)
     texts = PageTexts(title, options.credit, view.background, start)
     degree = min(options.sh, document.scene.sh_degree)
     packed = pack(document.scene, gdfs, options.quality, degree, stage)
     html = build_page(packed.data, texts)
     write_file(out, html)
-    error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
+    error = psnr(still_picture(packed.scene, document.gdfs, view, bands=DRAWN_SH[degree]), start)
     size = len(html.encode())
     whole = document.scene.sh_degree
     parts = [f"{size / 1e6:.2f} MB", options.quality]
@@ -95,6 +101,31 @@ def write_page(
     takes = "common hosts accept" if size > HOST else "most mail servers accept"
     warning = f"; larger than {takes}: use --sh 0 or fewer Gaussians" if size > MAIL_LIMIT_BYTES else ""
     return f"wrote {out}: {', '.join(parts)}{warning}"
+
+
+def still_picture(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    view: ViewState,
+    side: int = STILL_SIDE,
+    bands: int = DRAWN_SH[-1],
+) -> torch.Tensor:
+    """Render the still image of a page: a square of the view's field of view, and what is around it.
+
+    Args:
+        scene: the scene, or its quantized copy from a page
+        gdfs: its edits
+        view: layers and camera
+        side: side of the square, px
+        bands: number of drawn SH coefficients above degree 0
+
+    Returns:
+        [H,W,3], 0 to 1
+    """
+    width, height = (round(sides * side) for sides in STILL_SIDES)
+    tangent = math.tan(math.radians(view.camera.fov_y) / 2) * height / side
+    wide = replace(view.camera, fov_y=2 * math.degrees(math.atan(tangent)))
+    return picture(scene, gdfs, replace(view, camera=wide), (width, height), bands)
 
 
 def picture(

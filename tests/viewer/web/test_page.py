@@ -22,11 +22,13 @@ from progdf.compose.layers import BLENDS, Gains, Layer
 from progdf.compose.reference import compose_layers
 from progdf.field.baked import GradeForm, SliderRemap, identity_map, lattice_colors
 from progdf.field.grade import bake_grade
+from progdf.formats.ply import save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.anchors import free_anchors
 from progdf.gdf.file import Gdf, anchor_added, load_gdf, save_gdf
 from progdf.rasterize import render
 from progdf.region import from_mask
+from progdf.scene.selection import project_centers
 from progdf.similarity import affine_motion
 from progdf.tidy import Step, leave_paint, mirror, similarity, tidy
 from tests.helpers.draws import Draws
@@ -35,7 +37,7 @@ from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import bear_files, full_view, saved_session
 from tests.helpers.stacks import Stack, many_edits
 from tests.helpers.ui_rig import bear
-from viewer.camera.view_camera import first_camera, to_camera
+from viewer.camera.view_camera import ViewCamera, first_camera, to_camera
 from viewer.files.document import Document
 from viewer.files.web_page import PageOptions, write_page
 from viewer.state import snapshots, timeline
@@ -271,11 +273,15 @@ def bear_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stack]:
     return out, bear()
 
 
+def seen_camera(scene: Gaussians, camera: dict[str, Any]) -> ViewCamera:
+    """Return a page's camera as a camera of the window."""
+    values = {name: tuple(v) if isinstance(v, list) else v for name, v in camera.items()}
+    return replace(first_camera(scene), **values)
+
+
 def cpu_picture(stack: Stack, camera: dict[str, Any], strengths: Sequence[float]) -> np.ndarray:
     """Render with the CPU engine from the page's camera. [H,W,3] uint8"""
-    seen = replace(
-        first_camera(stack.scene), **{k: tuple(v) if isinstance(v, list) else v for k, v in camera.items()}
-    )
+    seen = seen_camera(stack.scene, camera)
     layers = [Layer(gdf, s) for gdf, s in zip(stack.gdfs, strengths, strict=True)]
     with torch.no_grad():
         edited = compose_layers(stack.scene, layers, "adjust")
@@ -456,20 +462,44 @@ def test_first_picture_has_few_pixels_and_the_still_stays_until_the_sharp_one(
     marks = opened.tab.evaluate("performance.getEntriesByType('mark').map((mark) => mark.name)")
     assert marks == ["first picture", "sharp picture"]
     assert opened.tab.evaluate("shares") == [0.25, 1]
-    sharp = opened.picture()
+
+
+@pytest.mark.parametrize("size", [(660, 400), (390, 720)], ids=["beside the panel", "phone"])
+def test_exported_page_shows_a_wide_subject_whole(open_page: Any, tmp_path: Path, size: tuple[int, int]) -> None:
+    scene = random_gaussians(400)
+    wide = replace(scene, means=scene.means * torch.tensor([4.0, 1.0, 1.0]))
+    save_ply(tmp_path / "wide.ply", wide)
+    assert main(["export", str(tmp_path / "wide.ply"), "-o", str(tmp_path / "wide.html"), "--up", "+y"]) == 0
+    opened = ready(open_page(tmp_path / "wide.html", size=size))
     panel = opened.tab.locator("#panel").bounding_box()
-    side = min(panel["x"], SIZE[1])
-    still = panel["x"] / 2, SIZE[1] / 2
-    source = opened.tab.evaluate("document.getElementById('still').src").split(",")[1]
-    drawn = Image.open(io.BytesIO(base64.b64decode(source))).convert("RGB")
-    scale = side / drawn.height * PIXELS[0] / SIZE[0]
-    small = drawn.resize((round(drawn.width * scale), round(drawn.height * scale)), Image.Resampling.BOX)
-    left = round(still[0] * PIXELS[0] / SIZE[0]) - small.width // 2
-    top = round(still[1] * PIXELS[1] / SIZE[1]) - small.height // 2
-    width = round(panel["x"] * PIXELS[0] / SIZE[0])
-    overlap = np.asarray(small)[:, -min(left, 0) : width - left]
-    shown = sharp[top : top + small.height, max(left, 0) : width][:, : overlap.shape[1]]
-    assert psnr(shown, overlap) > 22.0, "the picture does not jump"
+    free = (panel["x"], size[1]) if panel["x"] else (size[0], panel["y"])
+    side = round(min(free))
+    centers = project_centers(wide, to_camera(seen_camera(wide, opened.camera()), side, side))
+    x = centers.points[:, 0] + (free[0] - side) / 2
+    assert np.mean((x > 0) & (x < free[0])) > 0.95  # all but strays
+
+
+@pytest.mark.parametrize(
+    "size", [(660, 400), (900, 400), (390, 720)], ids=["narrow", "wide", "phone with a panel below"]
+)
+def test_picture_replaces_the_still_without_a_jump(
+    open_page: Any, bear_page: tuple[Path, Stack], size: tuple[int, int]
+) -> None:
+    """The still fills the area beside the panel, and nothing in it moves when the picture is ready."""
+    opened = ready(open_page(bear_page[0], size=size))
+    opened.wait("document.body.classList.contains('sharp')")
+    panel = opened.tab.locator("#panel").bounding_box()
+    free = (panel["x"], size[1]) if panel["x"] else (size[0], panel["y"])
+    clip = {"x": 0, "y": 0, "width": free[0], "height": free[1]}
+    drawn, still = (_screenshot(opened, clip, shown) for shown in (True, False))
+    assert psnr(drawn, still) > 22.0
+
+
+def _screenshot(opened: Opened, clip: dict[str, float], drawn: bool) -> np.ndarray:
+    """Return a part of the page, with the picture or with the still. [H,W,3]"""
+    opened.tab.evaluate(f"document.body.classList.toggle('drawn', {str(drawn).lower()})")
+    picture = opened.tab.screenshot(clip=clip)
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
 
 
 @pytest.mark.parametrize(

@@ -36,16 +36,15 @@ export function axes(camera) {
 
 export const eyeOf = (camera) => addScaled(camera.pivot, [camera.distance, axes(camera).back]);
 
-// The pinhole camera of a picture [width, height] centered on its part `view` { x, y, width, height }.
+// The pinhole camera of a picture [width, height] centered on its left and top part of the size `free`.
 // A part narrower than high has the horizontal field of view of a square.
-export function pinhole(camera, width, height, view) {
+export function pinhole(camera, width, height, free) {
   const picture = axes(camera), eye = eyeOf(camera);
-  const side = Math.min(view.height, view.width);
-  const focal = side / 2 / Math.tan(radians(camera.fov_y) / 2);
+  const focal = Math.min(...free) / 2 / Math.tan(radians(camera.fov_y) / 2);
   const rows = [picture.right, picture.up.map((x) => -x), picture.back.map((x) => -x)];
   return {
     rows, eye, width, height,
-    intrinsics: [focal, focal, view.x + view.width / 2, view.y + view.height / 2],
+    intrinsics: [focal, focal, free[0] / 2, free[1] / 2],
   };
 }
 

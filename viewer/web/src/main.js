@@ -127,6 +127,7 @@ class Page {
     const ratio = Math.min(devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
     this.canvas.width = Math.max(1, Math.round(width * ratio));
     this.canvas.height = Math.max(1, Math.round(height * ratio));
+    this.#placeStill();
     this.request();
   }
 
@@ -149,17 +150,25 @@ class Page {
     this.request();
   }
 
-  // The camera is centered on the free area beside the panel.
+  // Returns the width and height of the free area beside the panel, CSS pixels. The picture is centered on it.
+  #free() {
+    const { clientWidth: width, clientHeight: height } = this.canvas, panel = this.get("panel");
+    if (this.root.classList.contains("folded")) return [width, height];
+    const beside = panel.offsetWidth < 0.7 * width, free = beside ? [panel.offsetLeft, height] : [width, panel.offsetTop];
+    return Math.min(...free) < 40 ? [width, height] : free;
+  }
+
+  // Lays the still where the picture will be drawn.
+  #placeStill() {
+    const [width, height] = this.#free(), { style } = this.get("still");
+    Object.assign(style, { left: `${width / 2}px`, top: `${height / 2}px` });
+    style.setProperty("--side", `${Math.min(width, height)}px`);
+  }
+
   #pinhole() {
-    const { canvas } = this, scale = canvas.width / Math.max(canvas.clientWidth, 1);
-    const free = { x: 0, y: 0, width: canvas.width, height: canvas.height };
-    const panel = this.get("panel");
-    if (!this.root.classList.contains("folded")) {
-      if (panel.offsetWidth < 0.7 * canvas.clientWidth) free.width = Math.round(panel.offsetLeft * scale);
-      else free.height = Math.round(panel.offsetTop * scale);
-    }
-    if (free.width < 40 || free.height < 40) Object.assign(free, { width: canvas.width, height: canvas.height });
-    return pinhole(this.camera, canvas.width, canvas.height, free);
+    const { width, height, clientWidth } = this.canvas, scale = width / Math.max(clientWidth, 1);
+    const free = this.#free().map((side) => Math.round(side * scale));
+    return pinhole(this.camera, width, height, free);
   }
 
   // Draws a frame, at a share of its width and height that the device draws in time if none is given.
