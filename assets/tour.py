@@ -15,11 +15,10 @@ from imgui_bundle import imgui
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from progdf.formats.scene_file import load_scene
 from progdf.gdf.file import Gdf
 from tests.helpers.ui_rig import Rig, rig
 from viewer.camera.view_camera import first_camera
-from viewer.files.document import load_edits
+from viewer.files.document import load
 from viewer.panel import panel
 from viewer.state import selection
 from viewer.state.layers import with_slider_value
@@ -141,11 +140,10 @@ def main() -> None:
     parser.add_argument("gdfs", type=Path, nargs="+")
     parser.add_argument("-o", "--out", type=Path, required=True)
     options = parser.parse_args()
-    scene = load_scene(options.scene)
-    gdfs = load_edits(options.gdfs, scene, options.scene)
-    view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
-    with rig(view, SIZE, stack=_OpenedScene(scene, gdfs)) as hand:
-        hand.main_view.facts = replace(hand.main_view.facts, title=options.scene.name)
+    document = load(options.scene, options.gdfs)
+    aspect = (SIZE[0] - panel.WIDTH_PX) / SIZE[1]
+    view = replace(first_state(document.gdfs), camera=first_camera(document.scene, aspect=aspect))
+    with rig(view, SIZE, stack=document) as hand:
         SHOTS[options.name](hand)
         hand.frame(3)
         picture = Image.fromarray(hand.image())
@@ -170,14 +168,6 @@ def _quantize(window: Image.Image, panel_at: int) -> Image.Image:
     both.paste(picture, (0, 0))
     both.paste(right.point([(i + COLORS) % 256 for i in range(256)]), (panel_at, 0))
     return both
-
-
-class _OpenedScene:
-    """Scene and edits in the form that the rig expects."""
-
-    def __init__(self, scene: object, gdfs: tuple[Gdf, ...]) -> None:
-        self.scene = scene
-        self.gdfs = gdfs
 
 
 if __name__ == "__main__":

@@ -187,7 +187,7 @@ def rig(
     points: tuple[int, int] = (640, 540),
     density: float = 1.0,
     scale: float = 1.0,
-    stack: Stack | None = None,
+    stack: Stack | Document | None = None,
     pictures: Path | None = None,
     draw: str = "cpu",
 ) -> Iterator[Rig]:
@@ -198,13 +198,15 @@ def rig(
         points: size of the window in its own coordinates
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
+        stack: scene and edits; None is the bear
         pictures: folder of saved pictures; None is a folder that is removed at the end
         draw: renderer of the splats, as for the engine
     """
     stack = stack or bear()
     context = headless_context()
     engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
-    facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
+    document = stack if isinstance(stack, Document) else Document("bear.ply", stack.scene, stack.gdfs)
+    facts = document.facts()
     spare = TemporaryDirectory()
     folder = pictures or Path(spare.name)
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, folder)
