@@ -465,7 +465,9 @@ def test_first_picture_has_few_pixels_and_the_still_stays_until_the_sharp_one(
 
 
 @pytest.mark.parametrize("size", [(660, 400), (390, 720)], ids=["beside the panel", "phone"])
-def test_exported_page_shows_a_wide_subject_whole(open_page: Any, tmp_path: Path, size: tuple[int, int]) -> None:
+def test_exported_page_shows_a_wide_subject_whole(
+    open_page: Any, tmp_path: Path, size: tuple[int, int]
+) -> None:
     scene = random_gaussians(400)
     wide = replace(scene, means=scene.means * torch.tensor([4.0, 1.0, 1.0]))
     save_ply(tmp_path / "wide.ply", wide)
