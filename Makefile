@@ -10,7 +10,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -
 
 EXTRAS := styles,diffusion,api,segment,fill,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes,docs
 
-.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples site packages
+.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures tables examples site packages
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -74,27 +74,32 @@ bench: setup
 
 BEAR := viewer/examples/bear.progdf
 
-# Everything the README and the documents show that a command made.
+# The pictures of the README and the documents, without the charts of measurements, which `tables` draws.
 pictures: setup extras window browser
-	$(BIN)/progdf demo --out demo --no-window
-	cp demo/one-picture.png assets/
-	assets/window.sh $(BIN)/progdf demo assets/window.png
-	$(BIN)/python assets/page.py demo assets/page.jpg
-	$(BIN)/python assets/texture.py -o assets/texture.jpg
 	for shot in layers paint compare session timeline; do \
 	  $(BIN)/python assets/tour.py $$shot $(BEAR)/bear.compressed.ply $(BEAR)/gold.gdf $(BEAR)/scarf.gdf \
 	    -o assets/tour/$$shot.png || exit 1; done
 	$(BIN)/python assets/tour.py select $(BEAR)/bear.compressed.ply $(BEAR)/panda.gdf $(BEAR)/scarf.gdf -o assets/tour/select.png
+	$(BIN)/python assets/architecture.py
+	$(BIN)/python -m benchmarks recolors subject --plots assets
+	$(BIN)/python assets/tutorials.py
+	$(BIN)/python docs/site/gallery.py build/gallery
+	$(BIN)/python assets/exhibits.py build/gallery
+	$(BIN)/progdf demo --out demo --no-window
+	cp demo/one-picture.png assets/
+	assets/window.sh $(BIN)/progdf demo assets/window.png
+	$(BIN)/python assets/page.py demo assets/page.jpg
+	$(BIN)/python assets/layers.py -o assets/layers.jpg
+	$(BIN)/python assets/texture.py -o assets/texture.jpg
+
+# The tables of the documents with their charts, then the README's figures from them. Times need a quiet machine.
+tables: setup extras window browser
 	$(BIN)/python -m benchmarks --markdown docs/*.md docs/lab/*.md --plots assets
 	$(BIN)/progdf evaluate --suite sliders runs/sliders --threads 1
 	$(BIN)/python -c "from PIL import Image; \
 	  Image.open('runs/sliders/sliders.png').convert('RGB').save('assets/sliders.jpg', quality=85, optimize=True)"
 	$(BIN)/python -m benchmarks sliders --runs runs/sliders --markdown docs/benchmarks.md
 	$(BIN)/python assets/figures.py
-	$(BIN)/python assets/architecture.py
-	$(BIN)/python assets/tutorials.py
-	$(BIN)/python docs/site/gallery.py build/gallery
-	$(BIN)/python assets/exhibits.py build/gallery
 
 # The site with the gallery and the reference of the Python interface; open build/site/index.html.
 site: setup extras

@@ -65,6 +65,7 @@ DRY_RUNS = {
     "make lint": "takes minutes, and runs before every change lands",
     "make bench": "measures for an hour; its benchmarks run small in other tests",
     "make pictures": "overwrites the pictures of the documents",
+    "make tables": "overwrites the tables of the documents; the benchmarks run small in other tests",
     "make site": "installs packages; a test of its own builds the site",
     "make packages": "installs packages for minutes",
     "make examples": "trains for minutes; the same edits are trained small in other tests",
