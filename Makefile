@@ -75,6 +75,7 @@ bench: setup
 BEAR := viewer/examples/bear.progdf
 
 # The pictures of the README and the documents, without the charts of measurements, which `tables` draws.
+pictures: export OMP_WAIT_POLICY := PASSIVE
 pictures: setup extras window browser
 	for shot in layers paint compare session timeline; do \
 	  $(BIN)/python assets/tour.py $$shot $(BEAR)/bear.compressed.ply $(BEAR)/gold.gdf $(BEAR)/scarf.gdf \

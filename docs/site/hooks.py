@@ -21,9 +21,13 @@ PAGES = {
 GALLERY = ROOT / "build" / "gallery"
 """Exported pages, made by `docs/site/gallery.py`."""
 
+UNBROKEN = 24  # characters of a code span that stays in one line
+
 STYLE = "assets/site.css"
 """Name of `site.css` in the site."""
 
+_CODE_SPAN = re.compile(r"(?<!<span></span>)<code>([^<\n]+)</code>")
+_TABLE_ROW = re.compile(r"^\|.*\|$", re.MULTILINE)
 _CODE_LINK = re.compile(r"\[([^\]\[]*)\]\([^)]+\.(?:py|ipynb)\)|\[([^\]\[]*)\]\(LICENSE\)")
 _COMMANDS = re.compile(r"^```\n(?=(?:progdf|make|python3?|pip|\.venv/bin/\w+) )", re.MULTILINE)
 _EXHIBIT = re.compile(r"!\[[^\]]*\]\(\.\./assets/exhibits/([\w-]+)\.jpg\)")
@@ -51,7 +55,8 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Lead links of the repository to pages of the site, unlink those to code, and link exhibits.
 
-    Blocks of commands get the class `commands`, which wraps them.
+    Blocks of commands get the class `commands`, which wraps them. A `|` in the code of a table loses its
+    escape, which the site would show.
     """
     source = page.file.src_uri
     if source == "gallery.md":
@@ -60,6 +65,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     written = {name: path for path, name in PAGES.items()}.get(source, f"docs/{source}")
     folder = written.rpartition("/")[0]
     markdown = _COMMANDS.sub("``` { .text .commands }\n", markdown)
+    markdown = _TABLE_ROW.sub(lambda row: re.sub(r"`[^`]+`", _without_escapes, row.group(0)), markdown)
 
     def convert(match: re.Match[str]) -> str:
         before, target = match.groups()
@@ -69,6 +75,22 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 
     linked = _CODE_LINK.sub(lambda match: match.group(1) or match.group(2), markdown)
     return _LINK.sub(convert, linked)
+
+
+def _without_escapes(code: re.Match[str]) -> str:
+    return code.group(0).replace("\\|", "|")
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Keep short code spans such as `--fill` in one line, and let long ones break after each `|`."""
+
+    def convert(match: re.Match[str]) -> str:
+        text = match.group(1)
+        if len(text) <= UNBROKEN:
+            return f'<code class="unbroken">{text}</code>'
+        return f"<code>{text.replace('|', '|<wbr>')}</code>"
+
+    return _CODE_SPAN.sub(convert, html)
 
 
 def site_link(source: str, folder: str, target: str) -> str:

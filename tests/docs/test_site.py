@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -47,6 +47,24 @@ def test_every_page_is_in_the_navigation() -> None:
 )
 def test_links_lead_to_pages_of_the_site(source: str, folder: str, target: str, link: str) -> None:
     assert load_script("hooks").site_link(source, folder, target) == link
+
+
+def test_bars_in_the_code_of_a_table_show_without_their_escape() -> None:
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="cli.md"))
+    row = r"| `--scene bear\|room` | a \| b |"
+    written = load_script("hooks").on_page_markdown(f"{row}\n\n`a\\|b`\n", page, None, None)
+    assert written == "| `--scene bear|room` | a \\| b |\n\n`a\\|b`\n"
+
+
+def test_short_code_spans_stay_in_one_line() -> None:
+    convert = load_script("hooks").on_page_content
+    long = "--fill none|picture|smooth|surface"
+    block = "<pre><span></span><code>a\n</code></pre>"
+    html = f"<code>--fill</code> <code>{long}</code> {block}"
+    shown = convert(html, None, None, None)
+    assert shown.startswith('<code class="unbroken">--fill</code> ')
+    assert shown.replace("<wbr>", "").endswith(f" <code>{long}</code> {block}")
+    assert shown.count("|<wbr>") == long.count("|")
 
 
 def test_gallery_lists_every_exhibit_with_its_picture_and_credit() -> None:
