@@ -127,7 +127,8 @@ class Page {
     const ratio = Math.min(devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
     this.canvas.width = Math.max(1, Math.round(width * ratio));
     this.canvas.height = Math.max(1, Math.round(height * ratio));
-    this.#placeStill();
+    const [right, bottom] = this.#free();  // the still lies where the picture will be drawn
+    this.get("still").style = `left: ${right / 2}px; top: ${bottom / 2}px; --side: ${Math.min(right, bottom)}px`;
     this.request();
   }
 
@@ -158,17 +159,9 @@ class Page {
     return Math.min(...free) < 40 ? [width, height] : free;
   }
 
-  // Lays the still where the picture will be drawn.
-  #placeStill() {
-    const [width, height] = this.#free(), { style } = this.get("still");
-    Object.assign(style, { left: `${width / 2}px`, top: `${height / 2}px` });
-    style.setProperty("--side", `${Math.min(width, height)}px`);
-  }
-
   #pinhole() {
     const { width, height, clientWidth } = this.canvas, scale = width / Math.max(clientWidth, 1);
-    const free = this.#free().map((side) => Math.round(side * scale));
-    return pinhole(this.camera, width, height, free);
+    return pinhole(this.camera, width, height, this.#free().map((side) => Math.round(side * scale)));
   }
 
   // Draws a frame, at a share of its width and height that the device draws in time if none is given.
