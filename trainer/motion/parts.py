@@ -184,22 +184,39 @@ def _motion(values: Tensor, parts: Parts) -> Motion:
     return Motion(values[:, :3] * parts.sizes[:, None], values[:, 3], values[:, 4:])
 
 
-def mean_distance(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor]) -> float:
+def mean_distance(
+    crops: Sequence[CropScene],
+    rows: Tensor,
+    targets: Sequence[Tensor],
+    attributes: Sequence[str] = MOVING_ATTRIBUTES,
+) -> float:
     """Return the mean distance of all views from their targets, at full sharpness and blurred.
 
-    `rows`: raw member rows. [M,C]
+    Args:
+        crops: the views
+        rows: raw member rows. [M,C]
+        targets: edited box of each view. [h,w,3] each
+        attributes: attributes that differ from the original's; the others are ignored
     """
     with torch.no_grad():
         pairs = zip(crops, targets, strict=True)
-        return sum(float(view_distance(crop, rows, target)) for crop, target in pairs) / len(targets)
+        total = sum(float(view_distance(crop, rows, target, attributes)) for crop, target in pairs)
+    return total / len(targets)
 
 
-def view_distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
+def view_distance(
+    scene: CropScene,
+    rows: Tensor,
+    target: Tensor,
+    attributes: Sequence[str] = MOVING_ATTRIBUTES,
+    wide: bool = False,
+) -> Tensor:
     """Return the L1 distance at full sharpness and blurred, or widely blurred only (`wide`).
 
-    Blurred pictures attract a part to a position that it does not overlap yet.
+    Blurred pictures attract a part to a position that it does not overlap yet. Attributes other than
+    `attributes` are the original's.
     """
-    image = scene.render(rows, MOVING_ATTRIBUTES)
+    image = scene.render(rows, attributes)
     difference = image - target
     loss = difference.new_zeros(()) if wide else difference.abs().mean()
     longer = max(scene.size)

@@ -6,6 +6,8 @@ for example for an ear that is bent or an arm that is stretched, control points 
 own offsets then live in the moved frames: the offsets of a hand move, rotate and scale with it
 (docs/method.md 3). Between two strengths the region follows the interpolated motion, not the optimizer's
 path, so a slider shows the hand in motion.
+
+Parts that only fade are found first, since a motion out of sight shows the same finished pictures.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from torch import Tensor
 from progdf.gaussians import Gaussians, attribute_slices
 from progdf.scene.bounds import scene_sphere
 from progdf.similarity import Motion, Parts, make_parts
+from trainer.motion.fade import FadePlacement, FadeSearch
 from trainer.motion.node_search import NodeSearch
 from trainer.motion.nodes import NodeMotion, NodePlacement, place_nodes, rest_nodes
 from trainer.motion.parts import GroupSearch, OnStep, connected_parts, mean_distance
@@ -67,6 +70,7 @@ class Groups:
     # motions of control points, one per stage; empty if parts move as wholes
     warps: tuple[WarpPlacement, ...] = ()
     nodes: tuple[NodePlacement, ...] = ()  # motions of nodes, one per stage, which replace the others
+    fades: tuple[FadePlacement, ...] = ()  # opacity that is left, one per stage; the parts then do not move
 
     @property
     def extent(self) -> float:
@@ -77,7 +81,7 @@ class Groups:
     def placements(self) -> tuple[RegionMotion, ...]:
         """Motion at the end of each stage."""
         rigid = tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
-        return self.nodes or self.warps or rigid
+        return self.fades or self.nodes or self.warps or rigid
 
     @property
     def rest(self) -> RegionMotion:
@@ -110,8 +114,11 @@ class Groups:
         return self.placements[-1].lines()
 
     def capture_state(self) -> dict[str, Tensor]:
-        """Return the part of each member [M] and motions of parts [T,P,7], control points [T,C,12] and nodes
-        [T,n,6], for `restore_groups`."""
+        """Return the state for `restore_groups`.
+
+        These are the part of each member [M], and per stage the motions of parts [T,P,7], control points
+        [T,C,12] and nodes [T,n,6], and the opacity that is left of the parts [T,P].
+        """
         motions = [torch.cat([m.shift, m.log_scale[:, None], m.turn], dim=1) for m in self.motions]
         state = {"part": self.parts.part, "motions": torch.stack(motions)}
         if self.warps:
@@ -120,6 +127,8 @@ class Groups:
         if self.nodes:
             nodes = [torch.cat([n.motion.positions, n.motion.turn], dim=1) for n in self.nodes]
             state["nodes"] = torch.stack(nodes)
+        if self.fades:
+            state["fades"] = torch.stack([fade.share for fade in self.fades])
         return state
 
 
@@ -156,13 +165,16 @@ def group_stage(
     """
     means = original[:, attribute_slices(original.shape[1])["means"]]
     parts = make_parts(original, connected_parts(means.cpu()).to(means.device))
-    search = GroupSearch(original, parts, crops, steps, seed)
-    motions: list[Motion] = []
 
     def step_done(stage: int, step: int, loss: float) -> None:
         if on_step is not None:
             on_step(stage * steps + step, loss)
 
+    fades = fade_parts(FadeSearch(original, parts, crops, seed), targets, step_done)
+    if fades:
+        return Groups(parts, tuple(parts.rest_motion() for _ in targets), fades=fades)
+    search = GroupSearch(original, parts, crops, steps, seed)
+    motions: list[Motion] = []
     for stage, pictures in enumerate(targets):
         start = motions[-1] if motions else parts.rest_motion()
         motions.append(search.find(pictures, start, partial(step_done, stage)))
@@ -192,7 +204,34 @@ def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
     if "nodes" in saved:
         graph = NodeSearch(original, ()).nodes
         nodes = tuple(NodePlacement(graph, NodeMotion(n[:, :3], n[:, 3:])) for n in saved["nodes"])
-    return Groups(make_parts(original, saved["part"]), motions, warps, nodes)
+    parts = make_parts(original, saved["part"])
+    fades = tuple(FadePlacement(parts, share) for share in saved.get("fades", ()))
+    return Groups(parts, motions, warps, nodes, fades)
+
+
+def fade_parts(
+    search: FadeSearch, targets: Sequence[Sequence[Tensor]], on_step: Callable[[int, int, float], None]
+) -> tuple[FadePlacement, ...]:
+    """Return the opacity that is left of each part at the end of every stage, if fading is all they do.
+
+    Args:
+        search: search for the opacity of the parts
+        targets: target pictures of the stages
+        on_step: progress: stage, steps done in it, loss
+
+    Returns:
+        One placement per stage; empty if the finished edit is not a fade of whole parts.
+    """
+    whole = FadePlacement(search.parts, search.parts.sizes.new_ones(len(search.parts)))
+    finished = search.find(targets[-1], whole)
+    left = search.distance(targets[-1], finished)
+    if left > _MAX_PARTS_ERROR * search.distance(targets[-1], whole):
+        return ()
+    fades = list[FadePlacement]()
+    for stage, pictures in enumerate(targets[:-1]):
+        start = fades[-1] if fades else whole
+        fades.append(search.find(pictures, start, partial(on_step, stage)))
+    return (*fades, finished)
 
 
 def bend_groups(
