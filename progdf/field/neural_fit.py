@@ -45,6 +45,8 @@ EFFORT: Mapping[Size, tuple[int, int, float]] = {
 }
 """Size → steps, members per step, largest learning rate."""
 
+_SQUARE_DECAY = 0.999  # Adam's memory of squared gradients
+_LEAST_SQUARE = 1e-16  # square of Adam's ε
 _WARMUP_STEPS = 50
 
 
@@ -100,7 +102,9 @@ class NeuralFit:
             self._learned["codes"] = 0.1 * torch.randn(len(rows), self.shape.code, generator=self._generator)
         for tensor in self._learned.values():
             tensor.requires_grad_()
-        self._adam = torch.optim.Adam(list(self._learned.values()), lr=self._rate, fused=True)
+        self._adam = torch.optim.Adam(
+            list(self._learned.values()), lr=self._rate, betas=(0.9, _SQUARE_DECAY), fused=True
+        )
         visible = channel_weights(visibility, len(rows), 1)[:, 0]
         self._visibility = visible / visible.mean().clamp_min(1e-12)
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
@@ -179,8 +183,25 @@ class NeuralFit:
             group["lr"] = self._rate * factor * min(1.0, self.steps / _WARMUP_STEPS)
         self._adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        if pictures is not None:
+            self._limit_gradients()
         self._adam.step()
         return value
+
+    def _limit_gradients(self) -> None:
+        """Scale down the gradient of a tensor that exceeds its usual size, as StableAdamW does
+        (Wortsman et al., NeurIPS 2023).
+
+        A step sees one picture. Without the limit, a few exceptional pictures move Gaussians out of sight,
+        where no gradient brings them back.
+        """
+        for tensor in self._learned.values():
+            state = self._adam.state[tensor]
+            if tensor.grad is None or not state:
+                continue
+            usual = state["exp_avg_sq"] / (1.0 - _SQUARE_DECAY ** float(state["step"]))
+            ratio = tensor.grad.square() / usual.clamp_min(_LEAST_SQUARE)
+            tensor.grad /= ratio.mean().sqrt().clamp_min(1.0)
 
     def _offset_loss(self, strengths: Tensor, offsets: Tensor) -> Tensor:
         """Return the loss of random members, each at a random strength. []"""

@@ -172,7 +172,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
 
     Raises:
         ProgdfError: the file cannot be written.
-        ValueError: a number of the field is not finite.
+        ValueError: a number of the field is not finite, or an offset exceeds the limit of `check_reach`.
         TypeError: options or report contain a value that JSON cannot store.
     """
     check_first_argument("save_gdf(path, gdf)", path, (str, os.PathLike))
@@ -183,6 +183,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     broken = _find_non_finite(tensors)
     if broken:
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
+    check_reach(gdf.field)
     head = header.GdfHeader(
         name=gdf.name,
         instruction=gdf.instruction,
@@ -251,7 +252,7 @@ def load_gdf(
         )
     try:
         baked = bake_grade(form, rows) if isinstance(form, GradeForm) else bake_form(form, rows)
-        _check_reach(baked)
+        check_reach(baked)
         return replace(gdf, field=replace(baked, recorded=gdf.field.recorded))
     except (ValueError, RuntimeError) as error:
         raise header.contradiction_error(name, error) from error
@@ -303,7 +304,7 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
     field = replace(bake_grade(map_alone(stored, len(region)), rows), recorded=())
     try:
-        _check_reach(field)
+        check_reach(field)
     except ValueError as error:
         raise header.contradiction_error(gdf.name, error) from error
     parts = {"mask": stored.mask is not None, "residual": len(stored.residual) > 0}
@@ -341,7 +342,7 @@ def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
     if not 0 <= head.scene.count <= header.MAX_GAUSSIANS or head.members > head.scene.count:
         raise ValueError(f"{head.members} members of a scene of {head.scene.count} Gaussians")
     field = header.unpack_field(head.field, tensors, head.members)
-    _check_reach(field)
+    check_reach(field)
     members = field.members if field.attributes else head.members + head.added
     if field.origin is not None:
         members = field.origin.members
@@ -373,7 +374,7 @@ def _find_non_finite(tensors: Mapping[str, Tensor]) -> str:
     return next((name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())), "")
 
 
-def _check_reach(field: BakedField) -> None:
+def check_reach(field: BakedField) -> None:
     """Raise ValueError if an offset can exceed the limit at any strength, as sums could overflow."""
     for name, bases in field.attributes.items():
         max_coefficients = bases.coefficients.abs().amax(0).double()

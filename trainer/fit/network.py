@@ -19,6 +19,7 @@ from progdf.field.neural_fit import EFFORT, NeuralFit, rendered_importance, trai
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.gdf.file import check_reach
 from trainer.optimize.losses import Perceptual
 from trainer.options import FieldOptions
 from trainer.paper.losses import RenderedLoss
@@ -118,10 +119,14 @@ def fit_network(
         raise ProgdfError(f"{error}; try another --size, or --field auto") from error
     network = fit.field(tuple(float(s) for s in trajectory.s))
     errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
-    return NetworkFit(
-        bake_network(network, rows, trajectory.at, reporting.counted_pixels),
-        errors.curve(network.bind(rows)),
-    )
+    baked = bake_network(network, rows, trajectory.at, reporting.counted_pixels)
+    try:
+        check_reach(baked)
+    except ValueError as error:
+        raise ProgdfError(
+            f"the network has diverged ({error}); try another --seed, more --steps, or --field auto"
+        ) from error
+    return NetworkFit(baked, errors.curve(network.bind(rows)))
 
 
 def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual) -> RenderedLoss:

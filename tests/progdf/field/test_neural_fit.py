@@ -100,6 +100,30 @@ def test_image_loss_replaces_the_offset_loss() -> None:
     assert loss == pytest.approx(float((found - recorded).detach().abs().mean()))
 
 
+def test_exceptional_picture_moves_the_network_little() -> None:
+    strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
+
+    class Scaled(Watched):
+        factor = 1.0
+
+        def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+            return self.factor * super().__call__(found, recorded, view)
+
+    def change(factor: float) -> float:
+        """Return how far ten ordinary steps move the network after one step with a scaled loss."""
+        fit = NeuralFit(rows(), offsets.shape[2], ("sh0",), SHORT)
+        fit.scale_to(offsets)
+        pictures = Scaled()
+        train_network(fit, strengths, offsets, 60, pictures)
+        before = fit.field().bind(rows()).offsets(0.5)
+        for step in range(11):
+            pictures.factor = factor if step == 0 else 1.0
+            fit.step(strengths, offsets, pictures=pictures)
+        return float((fit.field().bind(rows()).offsets(0.5) - before).abs().max())
+
+    assert change(1e4) < 2.0 * change(1.0)
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_fit_works_with_at_most_one_member(count: int) -> None:
     strengths, offsets = curved_trajectory(max(count, 1))

@@ -140,6 +140,15 @@ def test_field_with_values_that_are_not_finite_is_not_saved(shirt: Gdf, tmp_path
     assert not list(tmp_path.iterdir())
 
 
+def test_field_that_would_not_load_is_not_saved(shirt: Gdf, tmp_path: Path) -> None:
+    bases = shirt.field.attributes["log_scales"]
+    wild = replace(bases, scale=1e6 * bases.scale)
+    field = replace(shirt.field, attributes={**shirt.field.attributes, "log_scales": wild})
+    with pytest.raises(ValueError, match="farther than any scene reaches"):
+        save_gdf(tmp_path / "a.gdf", replace(shirt, field=field))
+    assert not list(tmp_path.iterdir())
+
+
 def test_missing_folder_is_named(shirt: Gdf, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match=r"does not exist; create it first"):
         save_gdf(tmp_path / "nowhere" / "a.gdf", shirt)
