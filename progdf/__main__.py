@@ -20,6 +20,7 @@ from typing import NoReturn
 
 from .errors import ProgdfError, is_out_of_memory
 from .io.atomic import disk_full, state_folder, write_file
+from .system.packages import broken_package, import_fault, install_again
 from .system.processes import ENDINGS, handle_signals
 from .terminal import PrintableFormatter, elide, escape_text
 
@@ -47,6 +48,7 @@ HIDDEN = {
     "preview": "trainer.preview:serve",
     "window-test": "viewer.commands.window_test:main",
     "card-test": "progdf.cli.doctor:describe_card",
+    "import-test": "progdf.cli.doctor:import_packages",
 }
 """Internal commands, which the window and `progdf doctor` run → their entry points."""
 
@@ -106,6 +108,8 @@ def _describe_failure(error: BaseException) -> tuple[int, str]:
         raise error
     if is_out_of_memory(error):
         return 2, "out of memory; close other programs or use a smaller scene"
+    if package := broken_package(error):
+        return 2, f"the package {package} cannot be imported ({import_fault(error)}); {install_again()}"
     if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
         return 2, f"{error.object!r:.80} is not UTF-8, and cannot be written into a file; rename it"
     if isinstance(error, OSError):

@@ -7,6 +7,7 @@ the standard library only, except for folders and option parsing.
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import platform
@@ -16,19 +17,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
 from typing import Literal
 
-from progdf.errors import ProgdfError
 from progdf.io.atomic import cache_folder, state_folder
 from progdf.system.desktop import has_display
+from progdf.system.packages import DISTRIBUTION, broken_package, import_fault, install_again
 from progdf.system.processes import usable_cores
-from progdf.terminal import file_size, format_count, print_line
-
-PACKAGE = "progdf-studio"
+from progdf.terminal import escape_text, file_size, format_count, print_line
 
 COMPILE_LIMIT_S = 300.0
 """Time limit of a test that draws or trains, in seconds: the first one may compile kernels."""
@@ -50,6 +49,9 @@ VARIABLES = (
     *("CUDA_VISIBLE_DEVICES", "LIBGL_ALWAYS_SOFTWARE", "MESA_LOADER_DRIVER_OVERRIDE"),
 )
 """Environment variables that change speed or the choice of a driver."""
+
+MODULES = {"pillow": "PIL"}
+"""Required packages whose module has another name."""
 
 _TRAINING = ("--region", "all", "--editor", "recolor:#3060d0", "--quick", "--report", "none", "--seed", "0")
 
@@ -103,18 +105,33 @@ def main(argv: Sequence[str]) -> int:
 
 def examine() -> Iterator[Finding]:
     """Yield the findings in the order of the report; the tests come last."""
-    yield _system()
-    yield _packages()
-    yield _extras()
-    yield _processor()
-    yield _memory()
-    yield from _folders()
+    yield from _check("progdf", lambda: [_system()])
+    yield from _check("packages", _packages)
+    yield from _check("extras", lambda: [_extras()])
+    yield from _check("processor", lambda: [_processor()])
+    yield from _check("memory", lambda: [_memory()])
+    yield from _check("cache", lambda: [_folder("cache", cache_folder())])
+    yield from _check("state", lambda: [_folder("state", state_folder())])
+    yield from _check("temporary", _tests)
+
+
+def _check(subject: str, check: Callable[[], Iterable[Finding]]) -> Iterator[Finding]:
+    """Yield the findings of a check. If it fails itself, that is its finding, and the next ones run."""
     try:
-        folder = tempfile.TemporaryDirectory(prefix="progdf-doctor-", ignore_cleanup_errors=True)
-    except OSError as error:
-        yield Finding("FAILED", "temporary", f"no temporary folder can be made: {error.strerror or error}")
-        return
-    with folder as name:
+        yield from check()
+    except Exception as error:
+        if package := broken_package(error):
+            yield Finding("FAILED", subject, _import_failure(package, import_fault(error)))
+        elif isinstance(error, OSError):
+            where = f"{error.filename}: " if error.filename else ""
+            yield Finding("FAILED", subject, f"{where}{error.strerror or error}")
+        else:
+            yield Finding("FAILED", subject, import_fault(error))
+
+
+def _tests() -> Iterator[Finding]:
+    """Yield the findings of the tests, which share a scene in a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix="progdf-doctor-", ignore_cleanup_errors=True) as name:
         scene = Path(name) / "ball.ply"
         scene.write_text(ball_of_gaussians(GAUSSIANS), encoding="ascii")
         for test in (_drawing, _opengl, _window, _training, _card):
@@ -122,21 +139,54 @@ def examine() -> Iterator[Finding]:
 
 
 def _system() -> Finding:
-    own_version = _version_of(PACKAGE) or "not installed"
+    own_version = _version_of(DISTRIBUTION) or "not installed"
     python = f"Python {platform.python_version()}"
     return Finding("ok", "progdf", f"{own_version}, {python}, {platform.platform()}")
 
 
-def _packages() -> Finding:
-    """Report the versions of the required packages; a missing one is a failure."""
+def _packages() -> Iterator[Finding]:
+    """Report the versions of the required packages; a missing or a broken one is a failure."""
     names = [name for name, extra in _requirements() if not extra]
     versions = {name: _version_of(name) for name in names}
     missing = [name for name, found in versions.items() if found is None]
+    faults = _import_faults([MODULES.get(name, name.replace("-", "_")) for name in names if versions[name]])
     if missing:
-        return Finding(
-            "FAILED", "packages", f"{', '.join(missing)} missing; install {PACKAGE} with pip again"
-        )
-    return Finding("ok", "packages", ", ".join(f"{name} {found}" for name, found in versions.items()))
+        yield Finding("FAILED", "packages", f"{', '.join(missing)} missing; {install_again()}")
+    for package, fault in faults.items():
+        yield Finding("FAILED", "packages", _import_failure(package, fault))
+    if not missing and not faults:
+        yield Finding("ok", "packages", ", ".join(f"{name} {found}" for name, found in versions.items()))
+
+
+def _import_faults(modules: Sequence[str]) -> dict[str, str]:
+    """Import modules in a process of its own. Return the packages that cannot be imported, and why."""
+    made = _run("import-test", *modules, limit_s=START_LIMIT_S)
+    results = [line.split(" ", 2) for line in made.output.splitlines()]
+    faults = {package: fault for _, package, fault in results if fault != "ok"}
+    if len(results) < len(modules):  # a module ended the process
+        faults.setdefault(modules[len(results)], _ending(made))
+    return faults
+
+
+def import_packages(argv: Sequence[str]) -> int:
+    """Run the internal command `import-test`: import the named modules, and print a line for each.
+
+    A line has the module, the package at fault and the reason, or twice the module and ok.
+    """
+    for name in argv:
+        package = name
+        fault = "ok"
+        try:
+            importlib.import_module(name)
+        except BaseException as error:  # a package may raise SystemExit
+            package = broken_package(error) or name
+            fault = import_fault(error)
+        print(escape_text(f"{name} {package} {fault}"), flush=True)  # now, as the next one may crash
+    return 0
+
+
+def _import_failure(package: str, fault: str) -> str:
+    return f"the package {package} cannot be imported ({fault}); {install_again()}"
 
 
 def _extras() -> Finding:
@@ -155,7 +205,7 @@ def _extras() -> Finding:
 def _requirements() -> list[tuple[str, str]]:
     """Return the packages that this one asks for, each with its extra or ""."""
     try:
-        lines = requires(PACKAGE) or []
+        lines = requires(DISTRIBUTION) or []
     except PackageNotFoundError:
         return []
     found = []
@@ -199,21 +249,18 @@ def _memory() -> Finding:
     return Finding("ok", "memory", text)
 
 
-def _folders() -> Iterator[Finding]:
-    """Report the folders that the program writes, with the free space."""
-    for subject, folder in (("cache", cache_folder()), ("state", state_folder())):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                free = shutil.disk_usage(folder).free
-        except OSError as error:
-            yield Finding("note", subject, f"{folder} cannot be written: {error.strerror or error}")
-            continue
-        text = f"{folder}, {file_size(free)} free"
-        if free < LOW_SPACE:
-            yield Finding("note", subject, f"{text}; a run with its pictures may need more")
-        else:
-            yield Finding("ok", subject, text)
+def _folder(subject: str, folder: Path) -> Finding:
+    """Report a folder that the program writes, with the free space."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            free = shutil.disk_usage(folder).free
+    except OSError as error:
+        return Finding("note", subject, f"{folder} cannot be written: {error.strerror or error}")
+    text = f"{folder}, {file_size(free)} free"
+    if free < LOW_SPACE:
+        return Finding("note", subject, f"{text}; a run with its pictures may need more")
+    return Finding("ok", subject, text)
 
 
 def _drawing(scene: Path) -> Finding:
@@ -264,8 +311,13 @@ def describe_card(argv: Sequence[str]) -> int:
 def _judge(subject: str, made: Outcome, success: str) -> Finding:
     if made.status == 0:
         return Finding("ok", subject, f"{success}, {made.seconds:.1f} s")
+    return Finding("FAILED", subject, _ending(made))
+
+
+def _ending(made: Outcome) -> str:
+    """Return the reason for which a process failed."""
     ending = f"ended by signal {-made.status}" if made.status < 0 else f"exit status {made.status}"
-    return Finding("FAILED", subject, made.reason.removeprefix("progdf: ") or ending)
+    return made.reason.removeprefix("progdf: ") or ending
 
 
 def _run(*arguments: str | Path, limit_s: float = COMPILE_LIMIT_S) -> Outcome:
@@ -276,10 +328,11 @@ def _run(*arguments: str | Path, limit_s: float = COMPILE_LIMIT_S) -> Outcome:
         made = subprocess.run(
             line, stdin=subprocess.DEVNULL, capture_output=True, timeout=limit_s, check=False
         )
-    except subprocess.TimeoutExpired:
-        return Outcome(-1, limit_s, "", f"not finished after {limit_s:.0f} s")
+    except subprocess.TimeoutExpired as error:
+        output = (error.stdout or b"").decode(errors="replace")
+        return Outcome(-1, limit_s, output, f"not finished after {limit_s:.0f} s")
     except OSError as error:
-        raise ProgdfError(f"no process can be started: {error.strerror or error}") from None
+        return Outcome(-1, 0.0, "", f"no process can be started: {error.strerror or error}")
     errors = made.stderr.decode(errors="replace").strip().splitlines()
     output = made.stdout.decode(errors="replace")
     return Outcome(made.returncode, time.perf_counter() - begun, output, errors[-1] if errors else "")

@@ -17,8 +17,6 @@ from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from platformdirs import user_cache_path, user_pictures_path, user_state_path
-
 from progdf.errors import ProgdfError
 from progdf.system.files import is_owned, replace_file
 from progdf.system.processes import is_running
@@ -387,16 +385,22 @@ def is_locked(path: Path) -> bool:
 
 def cache_folder() -> Path:
     """Return the folder for reproducible files: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
+    from platformdirs import user_cache_path  # here, so that `progdf doctor` starts without the package
+
     return _or_temporary(user_cache_path("progdf", appauthor=False, opinion=False))
 
 
 def state_folder() -> Path:
     """Return the folder for persistent state: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
+    from platformdirs import user_state_path
+
     return _or_temporary(user_state_path("progdf", appauthor=False))
 
 
 def pictures_folder() -> Path:
     """Return the user's pictures folder, as configured on the desktop."""
+    from platformdirs import user_pictures_path
+
     return _or_temporary(user_pictures_path())
 
 

@@ -37,7 +37,7 @@ try:
     from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
     from numba.extending import intrinsic, lower_builtin, models, register_model
 except Exception as error:  # numba reads its settings on import and raises any error that they cause
-    if is_out_of_memory(error):
+    if is_out_of_memory(error) or isinstance(error, ImportError):  # not a setting
         raise
     raise ProgdfError(
         f"numba cannot be loaded ({type(error).__name__}: {error}); check the variables NUMBA_…, and "
