@@ -120,6 +120,7 @@ def test_extras_are_installable_and_messages_name_existing_extras() -> None:
     sources += [ROOT / "README.md", ROOT / "Makefile", *(ROOT / "docs").rglob("*.md")]
     texts = [path.read_text(encoding="utf-8") for path in sources]
     named = {n for text in texts for n in re.findall(r"progdf-studio\[([a-z,]+)\]", text)}
+    named |= {n for text in texts for n in re.findall(r"install_extra\(['\"](\w+)", text)}
     named |= {n for text in texts for n in re.findall(r"EXTRAS := (.*)", text)}
     assert {n for group in named for n in group.split(",")} <= set(extras)
     assert any("progdf-studio[" in text for text in texts)

@@ -22,6 +22,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.io.images import to_picture
 from progdf.io.json_values import convert_json, to_json
+from progdf.system.packages import install_extra
 
 from .camera.view_camera import LARGEST_SIDE, ViewCamera, first_camera
 from .files.document import Document
@@ -43,7 +44,7 @@ try:
     import anywidget
     import traitlets
 except ImportError as error:
-    raise ProgdfError("viewer.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
+    raise ProgdfError(f"viewer.Widget needs anywidget; {install_extra('jupyter')}") from error
 
 _SNAPSHOT_SIZE = 720, 480  # width and height of the picture where no script runs, px
 

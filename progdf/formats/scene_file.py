@@ -31,6 +31,7 @@ from progdf.io.atomic import atomic_write, read_file, write_files_together
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.io.part_files import part_files
 from progdf.metrics.readback import FLOAT_ROUNDING, ReadBack, check_finite, compare
+from progdf.system.packages import install_extra
 from progdf.terminal import escape_text
 
 from . import gltf, usd
@@ -519,7 +520,7 @@ def written_format(path: Path) -> str:
 
 def _require_gaussforge(path: Path, kind: str) -> None:
     if importlib.util.find_spec("gaussforge") is None:
-        raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; pip install progdf-studio[formats]")
+        raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; {install_extra('formats')}")
 
 
 def _failure_reason(status: int, stderr: bytes) -> str:

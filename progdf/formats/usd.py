@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.system.packages import install_extra
 
 SUFFIX = ".usdc"
 _PATH = "/Gaussians"
@@ -35,7 +36,7 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
         OSError: the file cannot be written.
     """
     if importlib.util.find_spec("pxr") is None:
-        raise ProgdfError(".usdc needs the package usd-core; pip install progdf-studio[usd]")
+        raise ProgdfError(f".usdc needs the package usd-core; {install_extra('usd')}")
     from pxr import Tf
 
     try:

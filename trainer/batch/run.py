@@ -26,6 +26,7 @@ from typing import Any, BinaryIO, Protocol, cast
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
+from progdf.system.packages import install_extra
 from progdf.terminal import escape_text, file_size, format_count, format_duration, print_line, shorten
 from trainer.editors import editor_row
 from trainer.options import BatchOptions, check_ranges
@@ -228,9 +229,9 @@ def open_pool(workers: int, address: str, threads: int, jobs: int) -> Iterator[P
     has_ray = find_spec("ray") is not None
     workers = min(jobs, workers or max(1, count_threads(0) // threads))
     if not has_ray and address:
-        raise ProgdfError("--address needs Ray; pip install progdf-studio[cluster]")
+        raise ProgdfError(f"--address needs Ray; {install_extra('cluster')}")
     if not has_ray and workers > 1:
-        _log.warning("one worker process; pip install progdf-studio[cluster] for %d at once", workers)
+        _log.warning("one worker process; for %d at once, %s", workers, install_extra("cluster"))
     pool = RayPool(address, workers * threads) if has_ray and (workers > 1 or address) else LocalPool()
     try:
         yield pool

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
+from progdf.system.packages import install_extra, pip_install
 from trainer.options import Device
 from trainer.store import pretrained
 from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_device, weights_here
@@ -226,7 +227,7 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
         import diffusers  # noqa: F401
     except ImportError as error:
         raise ProgdfError(
-            f"instruct: needs the package diffusers ({error}); pip install progdf-studio[diffusion]"
+            f"instruct: needs the package diffusers ({error}); {install_extra('diffusion')}"
         ) from error
     try:
         index = json.loads((pipeline_folder(model) / "model_index.json").read_bytes())
@@ -238,10 +239,9 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
     adapter = ADAPTERS[kind]
     for package in adapter.needs:
         if find_spec(package) is None:
-            raise ProgdfError(
-                f"{model} needs the package {package}; pip install -c constraints.txt "
-                "'progdf-studio[qwen]' (by itself it would replace torch)"
-            )
+            # without constraints pip would replace torch
+            remedy = pip_install("-c constraints.txt 'progdf-studio[qwen]'", '"progdf-studio[qwen]"')
+            raise ProgdfError(f"{model} needs the package {package}; {remedy}")
     if kind == "Flux2KleinPipeline" and not index.get("is_distilled", True):
         adapter = replace(adapter, steps=50, guidance=4.0, passes=2)  # a base model, not distilled
     return kind, adapter
@@ -332,9 +332,7 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
     adapter = request.adapter
     sizes = component_sizes(request.model, request.adapter)
     if request.quantize == "nf4" and find_spec("bitsandbytes") is None:
-        raise ProgdfError(
-            "--quantize nf4 needs the package bitsandbytes; pip install progdf-studio[quantize]"
-        )
+        raise ProgdfError(f"--quantize nf4 needs the package bitsandbytes; {install_extra('quantize')}")
     if model_device(device) == "cpu":
         count = sum(sizes.values())
         if count > _MAX_CPU_PARAMETERS and device != "cpu":

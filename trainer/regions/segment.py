@@ -16,6 +16,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
+from progdf.system.packages import install_extra
 from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
 from trainer.store import pretrained
 from trainer.store.pretrained import BROKEN, folder_of_model, model_device, weights_here
@@ -154,7 +155,7 @@ def _check_kind(config: Any, model: str, kind: str, option: str, usual: str) -> 
 
 
 def _import_failure(error: ImportError) -> ProgdfError:
-    return ProgdfError(f"text: needs the package transformers ({error}); pip install progdf-studio[segment]")
+    return ProgdfError(f"text: needs the package transformers ({error}); {install_extra('segment')}")
 
 
 def _missing(model: str, option: str) -> ProgdfError:

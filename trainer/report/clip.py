@@ -19,13 +19,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
 from progdf.errors import ProgdfError
+from progdf.system.packages import install_extra
 from trainer.store.pretrained import BROKEN, keep_quiet, missing_weights
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
 """CLIP model for which papers report figures."""
-
-EXTRA = "pip install progdf-studio[clip]"
-"""Remedy for a missing package, for messages."""
 
 ROUNDING = 1e-5
 """Largest distance between unit-length features of the same input. A text and its copy in one batch differ by
@@ -76,7 +74,9 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
         from transformers import AutoConfig, AutoTokenizer, CLIPModel
         from transformers.utils import logging as speaks
     except ImportError as error:
-        raise ProgdfError(f"CLIP needs the package transformers ({error}); {EXTRA}") from error
+        raise ProgdfError(
+            f"CLIP needs the package transformers ({error}); {install_extra('clip')}"
+        ) from error
     keep_quiet(speaks)
     try:
         config = AutoConfig.from_pretrained(model, local_files_only=True)

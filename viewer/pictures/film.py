@@ -18,6 +18,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io import images
 from progdf.io.atomic import atomic_write, is_temporary, remove_abandoned, write_error, write_files_together
+from progdf.system.packages import install_extra
 from viewer.camera.view_camera import to_camera
 from viewer.render.engine import ViewEngine
 from viewer.state import timeline
@@ -168,7 +169,7 @@ def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.
 def check_encoder(path: Path) -> None:
     """Raise ProgdfError for an .mp4 if the package that encodes it is not installed."""
     if path.suffix.lower() == VIDEO and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ProgdfError(f"{path} needs a video encoder; pip install progdf-studio[video], or write a .gif")
+        raise ProgdfError(f"{path} needs a video encoder; {install_extra('video')}, or write a .gif")
 
 
 def film_size(out: Path, camera: Camera) -> tuple[int, int]:

@@ -14,6 +14,7 @@ from progdf.color.grade import CURVES, GRADE_RANGES, format_curve, format_wheel,
 from progdf.color.palette import are_alike
 from progdf.color.tone import WHEELS, Wheel
 from progdf.io import atomic
+from progdf.system.packages import install_extra
 from viewer.camera.view_camera import SHAPES
 
 Setting = Literal[
@@ -429,7 +430,7 @@ def missing_package(choice: EditorChoice) -> str:
     """Return a line about the missing package of an editor; "" if it is installed."""
     if not choice.package or find_spec(choice.package) is not None:
         return ""
-    return f"{choice.title} needs the extra '{choice.extra}'; pip install progdf-studio[{choice.extra}]"
+    return f"{choice.title} needs the extra '{choice.extra}'; {install_extra(choice.extra)}"
 
 
 FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}

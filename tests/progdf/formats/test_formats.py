@@ -241,7 +241,7 @@ def test_reader_that_crashes_hangs_or_is_missing_is_reported_in_one_line(
         assert said in message, message
         assert message.isprintable()
     monkeypatch.setattr(formats.importlib.util, "find_spec", lambda name: None)
-    assert "pip install progdf-studio[formats]" in refusal(load_scene, path)
+    assert "pip install 'progdf-studio[formats]'" in refusal(load_scene, path)
 
 
 @pytest.mark.parametrize(("name", "extra"), [("a.spz", "formats"), ("a.splat", "formats"), ("a.usdc", "usd")])

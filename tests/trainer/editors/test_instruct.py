@@ -225,7 +225,7 @@ def test_empty_prompt_is_refused() -> None:
 
 def test_missing_packages_are_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "diffusers", None)
-    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[diffusion\]"):
+    with pytest.raises(ProgdfError, match=r"pip install 'progdf-studio\[diffusion\]"):
         editor_of(EditorOptions(""))
 
 
@@ -362,7 +362,7 @@ def test_four_bit_weights_need_their_package_and_a_gpu(pix2pix: str, monkeypatch
     with pytest.raises(ProgdfError, match="nf4 needs a GPU"):
         editor_of(settings_of(pix2pix, quantize="nf4"))
     monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: None)
-    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[quantize\]"):
+    with pytest.raises(ProgdfError, match=r"pip install 'progdf-studio\[quantize\]"):
         editor_of(settings_of(pix2pix, quantize="nf4"))
 
 

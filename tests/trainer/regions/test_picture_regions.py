@@ -354,4 +354,4 @@ def test_model_of_another_kind_is_a_one_line_error(tiny: RegionOptions, tmp_path
 
 def test_missing_package_is_reported_with_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
-    assert "pip install progdf-studio[segment]" in refusal("text:scarf", settings(tmp_path))
+    assert "pip install 'progdf-studio[segment]'" in refusal("text:scarf", settings(tmp_path))

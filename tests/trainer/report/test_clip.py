@@ -123,7 +123,7 @@ def test_missing_or_wrong_clip_model_error_names_the_remedy(
     with pytest.raises(ProgdfError, match="bert model, not CLIP"):
         load_clip(str(tmp_path))
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[clip\]"):
+    with pytest.raises(ProgdfError, match=r"pip install 'progdf-studio\[clip\]"):
         load_clip("nobody/no-such-clip")
 
 

@@ -108,7 +108,7 @@ def test_missing_extra_is_reported_before_loading(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    assert f"pip install progdf-studio[{extra}]" in refused(capsys, **changes)
+    assert f"pip install 'progdf-studio[{extra}]'" in refused(capsys, **changes)
 
 
 @pytest.mark.parametrize("damage", ["none", "no detector", "no sam_model", "no weights", "cut weights"])

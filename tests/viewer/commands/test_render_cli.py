@@ -333,7 +333,7 @@ def test_missing_video_encoder_names_the_extra_to_install(
     monkeypatch.setattr(film.importlib.util, "find_spec", lambda name: None)
     assert run("render", "bear.ply", "ears.gdf", "--sweep", "ears", "-o", "x.mp4") == 2
     error = capsys.readouterr().err
-    assert error.startswith("progdf: x.mp4 needs a video encoder; pip install progdf-studio[video]")
+    assert error.startswith("progdf: x.mp4 needs a video encoder; pip install 'progdf-studio[video]'")
 
 
 def test_exported_scene_equals_the_composed_one(

@@ -281,7 +281,7 @@ def test_editor_reports_what_is_missing_before_training() -> None:
     assert form("pictures", pictures="/a.png, /b.png").spec == "pictures:/a.png,/b.png"
     assert "region" in form("recolor", region=TYPED).obstacle
     unknown = replace(CHOICES[0], package="no_such_package_at_all", extra="more")
-    assert missing_package(unknown) == "Recolor needs the extra 'more'; pip install progdf-studio[more]"
+    assert missing_package(unknown) == "Recolor needs the extra 'more'; pip install 'progdf-studio[more]'"
 
 
 def test_pictures_editor_finds_its_region_by_default() -> None:

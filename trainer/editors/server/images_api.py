@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from progdf.errors import ProgdfError
+from progdf.system.packages import install_extra
 from trainer.editors.cache import Recipe
 from trainer.editors.instruct import sentence
 from trainer.editors.painter import PaintRequest, RefusedError
@@ -306,7 +307,7 @@ def check_api(what: str, options: EditorOptions) -> ImagesApi:
     if not sentence(what):
         raise ProgdfError('api: needs an instruction; write api:"turn him into a marble statue"')
     if find_spec("openai") is None:
-        raise ProgdfError("api: needs the package openai; pip install progdf-studio[api]")
+        raise ProgdfError(f"api: needs the package openai; {install_extra('api')}")
     address = Address("api", options.api_url)
     address.check("http://127.0.0.1:8080/v1", KEY)
     if not options.model:
