@@ -335,19 +335,19 @@ def command(given: EditorInput) -> CommandEditor:
 def try_command(editor: CommandEditor, view: View) -> str:
     """Run the program twice on one view, and return a line about its pictures for the log.
 
-    The first picture is kept for the run.
+    The second picture is kept for the run, so that no unchanged one is.
 
     Raises:
         ProgdfError: the program fails, or does not change the view.
     """
     started = time.monotonic()
-    first = editor.edit(view, 1.0)
+    first = from_bytes(to_bytes(editor.call(view, 1.0)))
     seconds = time.monotonic() - started
     program = editor.command.program
     original = from_bytes(to_bytes(view.image))
     if torch.equal(first, original):
         raise ProgdfError(f"{program} does not change the view {view.camera.name}; check its arguments")
-    second = from_bytes(to_bytes(editor.call(view, 1.0)))
+    second = editor.edit(view, 1.0)
     difference = float((first - second).abs().max()) * 255
     line = f"{program}: a picture takes {format_duration(seconds)}"
     if difference == 0:

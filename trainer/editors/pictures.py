@@ -330,7 +330,7 @@ def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
     return moved
 
 
-_EDITED_ADVICE = "put the edited copies of RUN/views/original/*.png there, under the same names"
+_EDITED_ADVICE = "put edited copies of the views of a run or of progdf views there, under the same names"
 _PHOTOGRAPH_ADVICE = "put the photographs there, under the names of their cameras"
 
 

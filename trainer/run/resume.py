@@ -24,7 +24,7 @@ from trainer.editors import editor_row
 from trainer.editors.pictures import strengths_of
 from trainer.options import MAX_THREADS, ReportLevel, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
-from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
+from trainer.store.run_folder import ResumableError, RunFolder, begin_log, remove_leftovers
 
 _VERSION = 9  # version of the saved state; 9: the loss of a style has no term for sharpness
 # environment variables that select the kernels of numba and of the linear algebra libraries
@@ -171,7 +171,7 @@ def explain_stop(folder: RunFolder) -> Iterator[None]:
             trouble = f"{file} cannot be read or written ({error.strerror or error}); check its permissions"
         else:
             raise
-        raise ProgdfError(f"{trouble}, then continue with --resume") from error
+        raise ResumableError(f"{trouble}, then continue with --resume") from error
 
 
 def _file_of(error: OSError) -> str:

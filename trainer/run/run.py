@@ -23,6 +23,7 @@ from trainer.store.run_folder import (
     RunFolder,
     lock_folder,
     open_run_folder,
+    remove_refused_run,
     remove_stale_views,
     write_views,
 )
@@ -55,13 +56,21 @@ def train(
         on_delivery: called once the .gdf file is written, before the report
 
     Raises:
-        ProgdfError: invalid scene, region, cameras or edited views. No .gdf file is changed.
+        ProgdfError: invalid scene, region, cameras or edited views. No .gdf file is changed, and a new run
+            leaves no files, see `remove_refused_run`.
         KeyboardInterrupt: interrupted; the message explains how to resume. No .gdf file is changed, unless
             only the report was left.
     """
     options = resolve(options)
-    shared = shared or LastValueCache()
     check_command(options)
+    with remove_refused_run(RunFolder(options.out)):
+        return _train(options, quiet, shared or LastValueCache(), on_delivery)
+
+
+def _train(
+    options: TrainOptions, quiet: bool, shared: LastValueCache, on_delivery: Callable[[], None]
+) -> RunResult:
+    """Train with resolved and checked options, see `train`."""
     prepare_process(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
     lower = open_lower_layers(shown_pictures(options), options.scene, scene)

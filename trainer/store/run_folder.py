@@ -96,11 +96,17 @@ def _write(folder: Path, lines: Iterable[str]) -> None:
 
 
 _SIGNATURE = "progdf train"  # start of log.txt, which marks a run folder
+# files of the saved state of a run that has not trained yet
+_STATE_BEFORE_TRAINING = {"run.json", "progress.json", "region.safetensors", "edited.safetensors"}
 _LOCK_WAIT_S = 1.0  # a window that checks whether a run is locked holds the lock briefly
 
 
 _A = TypeVar("_A")
 _T = TypeVar("_T")
+
+
+class ResumableError(ProgdfError):
+    """Error after which the run can continue with --resume, such as a full disk."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +226,51 @@ def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
     folder = check_folder(root, edit)
     atomic.make_folder(root)
     return folder
+
+
+@contextlib.contextmanager
+def remove_refused_run(folder: RunFolder) -> Iterator[None]:
+    """Leave no files of a new run that is refused: it ends with a ProgdfError before any work is saved.
+
+    Work is a painted picture of a learned editor, a mask of text:"…", or a part of the training. It stays, as
+    it takes long to make. A folder that held a run before stays as it is.
+    """
+    root = folder.root
+    is_new = not folder.log.exists()
+    missing = [path for path in (root, *root.parents) if not path.exists()]
+    try:
+        yield
+    except ResumableError:
+        raise
+    except ProgdfError:
+        if is_new and not _has_work(folder):
+            with contextlib.suppress(OSError, ProgdfError):
+                with lock_folder(folder):
+                    _remove_refused_files(folder)
+                (root / atomic.LOCK).unlink(missing_ok=True)
+                for path in missing:
+                    path.rmdir()
+        raise
+
+
+def _has_work(folder: RunFolder) -> bool:
+    """Return True if the folder holds work of a run that is not made again at once."""
+    state = folder.state.path
+    saved = {entry.name for entry in state.iterdir()} if state.is_dir() else set[str]()
+    return bool(saved - _STATE_BEFORE_TRAINING) or bool(read_pictures_list(folder.paintings))
+
+
+def _remove_refused_files(folder: RunFolder) -> None:
+    """Delete the files of a run that has not trained yet; other files stay."""
+    remove_pictures_but_of(folder.views, ())
+    for path in (folder.views / PICTURES_LIST, *folder.paintings.glob("*.log")):
+        path.unlink(missing_ok=True)
+    for directory, _, _ in os.walk(folder.views, topdown=False):
+        with contextlib.suppress(OSError):  # holds another file
+            Path(directory).rmdir()
+    for path in (folder.draft, folder.cameras, folder.log):
+        path.unlink(missing_ok=True)
+    folder.state.end()
 
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
