@@ -10,6 +10,7 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.cameras import save_cameras
+from progdf.rasterize.first_start import compile_rasterizer, needs_kernels
 from progdf.region import Region
 from progdf.terminal import format_count
 from trainer.editors import editor_row
@@ -94,6 +95,8 @@ def _train(
             request = ReportRequest(options.report, deliver)
             for note in (*session.notes, *notes):
                 log.say(note)
+            if session.does in ("start", "go on"):
+                _compile_kernels(options, log)
             if editor_row(options.editor).run == "pasted":  # takes seconds, so it is not resumed
                 setup = TrainingSetup(base, region, lower=lower)
                 if lower is not None:
@@ -123,6 +126,14 @@ def _train(
             raise
         finally:
             log.close()
+
+
+def _compile_kernels(options: TrainOptions, log: RunLog) -> None:
+    """Compile the kernels that the run needs, the first time on a machine."""
+    purpose = "solve" if editor_row(options.editor).color_function else "descend"
+    if needs_kernels(purpose):
+        with log.kernels() as report:
+            compile_rasterizer(purpose, report)
 
 
 def _prepare_views(

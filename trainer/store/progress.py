@@ -6,7 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import write_file
+from progdf.rasterize.first_start import kernel_bar
 from progdf.system.processes import peak_mb
 from progdf.terminal import escape_text
 
@@ -223,6 +224,21 @@ class RunLog:
         else:
             yield advance
         self._ended_seconds[what] = time.perf_counter() - begun
+
+    @contextmanager
+    def kernels(self) -> Iterator[Callable[[int, int], None]]:
+        """Report the compilation of kernels, by the yielded function of ready kernels and of all.
+
+        A terminal shows a bar; the progress file gets a label and a count.
+        """
+        with kernel_bar() if self._bar else nullcontext() as bar:
+
+            def report(done: int, total: int) -> None:
+                self._write_state(label="Compiling kernels", count=f"{done} of {total}")
+                if bar is not None:
+                    bar(done, total)
+
+            yield report
 
     @contextmanager
     def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:

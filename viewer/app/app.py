@@ -56,10 +56,16 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
         ProgdfError: see `opens`.
     """
     with interruptible(), ThreadPoolExecutor(2) as workers:
-        draws = workers.submit(draw_once) if draws_with(splash.context, draw) == "cpu" else None
+        preparing = "Preparing to draw …"
+
+        def report(done: int, total: int) -> None:
+            nonlocal preparing
+            preparing = f"Compiling kernels {done} of {total} …"
+
+        draws = workers.submit(draw_once, report) if draws_with(splash.context, draw) == "cpu" else None
         opened, session = splash.wait(workers.submit(opens), "Opening …")
         if draws is not None:
-            splash.wait(draws, "Preparing to draw …")
+            splash.wait(draws, lambda: preparing)
         app = App(Window(splash), opened.document, opened.view, session, draw=draw)
         try:
             app.main_view.restart(opened.view, opened.snapshots)

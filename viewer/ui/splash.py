@@ -96,16 +96,28 @@ class Splash:
             self._picture.draw(self.context.screen, size, scale, text, seconds)
             glfw.swap_buffers(self.handle)
 
-    def wait(self, work: Future[_Made], text: str, listen: Callable[[], object] = glfw.poll_events) -> _Made:
+    def wait(
+        self,
+        work: Future[_Made],
+        text: str | Callable[[], str],
+        listen: Callable[[], object] = glfw.poll_events,
+    ) -> _Made:
         """Wait for the result of another thread; handle window events meanwhile, and show a splash after a
-        delay."""
+        delay.
+
+        Args:
+            work: runs in another thread
+            text: the current work, or a function that returns it
+            listen: handles the events
+        """
         begun = time.perf_counter()
         patience = SPLASH_DELAY_S
         while not wait([work], patience).done:
             patience = EVERY_S
             seconds = time.perf_counter() - begun
             listen()
-            self.draw(text if seconds < FIRST_S else f"{text} {FIRST_TEXT}", seconds)
+            words = text if isinstance(text, str) else text()
+            self.draw(words if seconds < FIRST_S else f"{words} {FIRST_TEXT}", seconds)
         return work.result()
 
 

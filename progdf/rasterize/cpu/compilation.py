@@ -9,10 +9,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from .jit import kernel_cache
+from .jit import kernel_cache, listeners
 
 _POLL_S = 0.2  # seconds between two looks at the process that compiles
 
@@ -26,6 +27,31 @@ def mark_compiled(module: str) -> None:
     """Note that the kernels of a module are in the cache."""
     with suppress(OSError):
         _marker(module).touch()
+
+
+@contextmanager
+def count_kernels(total: int, report: Callable[[int, int], None]) -> Iterator[None]:
+    """Report 0 of `total`, and the number of ready kernels after each one that is first called in the block.
+
+    Args:
+        total: number of kernels that the block calls; the number never exceeds it
+        report: receives both numbers, also from other threads
+    """
+    done = 0
+    lock = threading.Lock()
+
+    def count() -> None:
+        nonlocal done
+        with lock:
+            done = min(done + 1, total)
+            report(done, total)
+
+    report(0, total)
+    listeners.append(count)
+    try:
+        yield
+    finally:
+        listeners.remove(count)
 
 
 def compile_elsewhere(module: str, stop: threading.Event) -> None:

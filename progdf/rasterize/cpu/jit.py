@@ -63,6 +63,9 @@ Python's int and float cannot express float32 or uint64.
 _F = TypeVar("_F", bound=Callable[..., Any])
 _first_call = threading.Lock()
 
+listeners: list[Callable[[], None]] = []
+"""Functions to call after each kernel that has been compiled, or loaded from the disk."""
+
 
 def kernel(
     *, fast: bool = False, contract: bool = False, cache: bool = False, inline: bool = False,
@@ -111,6 +114,8 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
                     loaded = _with_cache_folder(compile_now, function)
                     result = loaded(*arguments)
             compiled = loaded
+            for listener in listeners:
+                listener()
             return result
 
         @wraps(function)
