@@ -65,6 +65,9 @@ PAGE = (
 )
 """Benchmarks of docs/speed-and-error.md."""
 
+PAGE_OF_SCENES = ("training", "field", "exports")
+"""Those of `PAGE` that measure the files of --scenes too."""
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -151,7 +154,7 @@ def main(argv: Sequence[str]) -> int:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
     arguments: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
-    with_scenes = (*charted, "exports") if options.what[: len(PAGE)] == PAGE else drawing
+    with_scenes = PAGE_OF_SCENES if options.what[: len(PAGE)] == PAGE else drawing
     arguments |= {name: {"scenes": options.scenes} for name in with_scenes}
     if options.plots:
         for name in plotted:

@@ -13,14 +13,14 @@ from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, table, training
 from benchmarks.ablation import regret, setup
 from benchmarks.analytic_warps import column_warps
-from benchmarks.colors import packing, stages
+from benchmarks.colors import grading, packing, stages
 from benchmarks.editors import ideal_editors
 from benchmarks.files import exports
-from benchmarks.layers import pull_parts
+from benchmarks.layers import gains, paint_order, pull_parts, pull_stages
 from benchmarks.motion import trained_motion, warps
 from benchmarks.motion.trained_motion import PullCase
 from benchmarks.rasterizer import RasterCase
-from benchmarks.viewer import frames, moving, popping, pull_response, scenes, slider, window
+from benchmarks.viewer import frames, moving, painting, popping, pull_response, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
@@ -44,6 +44,7 @@ def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(stages, "OPTIONS", ("--views", "5", "--image-size", "48", "--steps", "24", "--stages", "2"))
     patch.setattr(stages, "compile_kernels", lambda options: None)
     _shrink_training(patch)
+    _shrink_layers(patch)
     _shrink_viewer(patch)
     _shrink_rasterizer(patch)
 
@@ -142,6 +143,17 @@ def _first_of(cases: Callable[..., list[PullCase]]) -> Callable[..., list[PullCa
     return lambda *given: cases(*given)[:1]
 
 
+def _shrink_layers(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(gains, "COUNTS", (300,))
+    patch.setattr(gains, "STEPS", 3)
+    patch.setattr(paint_order, "SIDE", 60)
+    patch.setattr(paint_order, "DISCS", 30)
+    patch.setattr(paint_order, "STEPS", 3)
+    patch.setattr(pull_stages, "CASES", ((300, 60),))
+    patch.setattr(pull_stages, "STEPS", 3)
+    patch.setattr(pull_stages, "_REPEATS", 1)
+
+
 def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(scenes, "SIZES", (600,))
     patch.setattr(slider, "CASES", (SliderCase(100, True),))
@@ -158,6 +170,12 @@ def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(moving, "begin_training", lambda scene: begin_training(scene, *SMALL_TRAINING))
     patch.setattr(moving, "_SETTLE_S", 0.05)
     patch.setattr(moving, "measure", partial(moving.measure, steps=2, size=PICTURE))
+    patch.setattr(painting, "DABS", 3)
+    patch.setattr(painting, "TURNS", 2)
+    patch.setattr(painting, "_REST_S", 0.2)
+    patch.setattr(painting, "measure", partial(painting.measure, size=PICTURE))
+    patch.setattr(grading, "WARM_UP", 2)
+    patch.setattr(grading, "measure", partial(grading.measure, steps=4))
     patch.setattr(popping, "FRAMES", 3)
     patch.setattr(popping, "room", lambda count: demo_scenes.room(1000))
     patch.setattr(popping, "film", partial(popping.film, size=PICTURE))
