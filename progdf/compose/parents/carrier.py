@@ -23,12 +23,14 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.gdf.motions import LinearMap, PartMotions
 from progdf.system.equality import equal_fields
+from progdf.threads import map_threads
 
 from .rows import MOVED, Anchored, anchored_rows, carry_added, carry_members, is_move, part_maps
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
+_CHUNK_MEMBERS = 8192  # members that a thread moves at once
 _NO_VALUES = np.zeros(0, np.float32)  # stands for weights that are all 1, and for coverage that is all 0
 
 
@@ -125,7 +127,8 @@ class Carrier:
         if layer.weights is not None:
             chosen = chosen[weights.numpy()[chosen] > 0.0]
         if len(chosen):
-            self._move_members(move, layer, chosen, maps, weights)
+            parts = np.array_split(chosen, math.ceil(len(chosen) / _CHUNK_MEMBERS))
+            map_threads(lambda part: self._move_members(move, layer, part, maps, weights), parts)
         for found, values in added:
             for name in self.tensors:
                 self._now[name][found.rows] = values[name]
@@ -175,11 +178,14 @@ class Carrier:
         self, move: _Move, added: Anchored, layer: Layer, maps: Sequence[LinearMap], weights: Tensor
     ) -> dict[str, Tensor]:
         needed = np.unique(added.members.numpy())
-        offsets = self._offsets(move, layer, needed)
+        offsets = {}
+        for name, values in self._offsets(move, layer, needed).items():
+            offsets[name] = torch.zeros(len(move.gdf.region), values.shape[1])  # of all members
+            offsets[name][torch.from_numpy(needed)] = values
         return carry_added(self._original, self._now, added, layer, maps, offsets, weights)
 
     def _offsets(self, move: _Move, layer: Layer, members: Rows) -> dict[str, Tensor]:
-        """Return the offsets of all members, of which only some are computed. [M,c]"""
+        """Return the offsets of some members. [m,c]"""
         segment = find_segment(move.gdf.field.knots, layer.strength)
         at = np.arange(len(members))
         offsets = {}
@@ -189,11 +195,7 @@ class Carrier:
             part = at, members, _NO_VALUES
             stored = bases.end, bases.residual
             add_offsets(total, part, stored, used, factors, np.float32(1.0), np.float32(0.0), _NO_VALUES)
-            whole = torch.from_numpy(total)
-            if len(members) < len(bases.end):
-                whole = torch.zeros(bases.end.shape)
-                whole[torch.from_numpy(members)] = torch.from_numpy(total)
-            offsets[name] = whole
+            offsets[name] = torch.from_numpy(total)
         return offsets
 
 

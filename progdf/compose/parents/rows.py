@@ -135,7 +135,8 @@ def carry(scene: Gaussians, composed: Gaussians, layers: Sequence[Layer]) -> Gau
             if found is not None:
                 added.append((found, carry_added(original, now, found, layer, maps, offsets, weights)))
         chosen = weights.nonzero()[:, 0]
-        carried = carry_members(original, now, chosen, layer, maps, offsets, weights)
+        own = {name: each[chosen] for name, each in offsets.items()}
+        carried = carry_members(original, now, chosen, layer, maps, own, weights)
         for name, values in carried.items():
             now[name][layer.gdf.region.members[chosen]] = values
         for found, rows in added:
@@ -165,7 +166,7 @@ def carry_members(
         chosen: indices of the members to return. [m]
         layer: the layer of the move
         maps: see `part_maps`
-        offsets: offsets of all members by attribute; absent ones are unchanged. [M,c]
+        offsets: offsets of these members by attribute; absent ones are unchanged. [m,c]
         weights: weights of all members. [M] float32
     """
     assert layer.gdf.motions is not None
@@ -178,7 +179,7 @@ def carry_members(
         carried[name] = below
         if name in offsets:
             factor = weights[chosen, None] * torch.tensor(layer.gain(name))
-            carried[name] = below + factor * offsets[name][chosen]
+            carried[name] = below + factor * offsets[name]
     part_of = torch.zeros(len(layer.gdf.region), dtype=torch.int64)
     part_of[: len(layer.gdf.motions.parts)] = layer.gdf.motions.parts
     in_region = chosen < len(layer.gdf.motions.parts)
@@ -264,7 +265,13 @@ def carry_added(
     offsets: Mapping[str, Tensor],
     weights: Tensor,
 ) -> Rows:
-    """Return added rows after a move of their anchors; arguments as in `carry_members`."""
+    """Return added rows after a move of their anchors.
+
+    Args:
+        added: rows and their anchors
+        offsets: offsets of all members by attribute; absent ones are unchanged. [M,c]
+        original, now, layer, maps, weights: as in `carry_members`
+    """
     motions = layer.gdf.motions
     assert motions is not None
     own = {name: now[name][added.rows].double() for name in MOVED}

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from progdf.compose.composer import Composer
 from progdf.compose.layers import BLENDS, Gains, Layer
+from progdf.compose.parents import carrier
 from progdf.compose.parents.rest import rest_frame
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
@@ -113,6 +114,21 @@ def test_strength_zero_of_parent_or_child_is_exact(
     moved = compose_layers(scene, [Layer(move, 0.6)], blend)
     with_child = [Layer(child, 0.0), Layer(logo, 0.0), Layer(move, 0.6)]
     assert bits(compose_layers(scene, with_child, blend)[:COUNT]) == bits(moved)
+
+
+@pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
+def test_members_move_in_small_parts_with_the_same_bits(
+    scene: Gaussians, motion: AffineMotion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gdfs = [child_of(scene), painted(scene, 20, 9), move_of(scene, motion)]
+    layers = [Layer(gdf, 0.7) for gdf in gdfs]
+    found = []
+    for members in (COUNT, 7):
+        monkeypatch.setattr(carrier, "_CHUNK_MEMBERS", members)
+        composer = Composer(scene, gdfs)
+        composer.update(layers)
+        found.append(bits(composer.gaussians))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("blend", BLENDS)
