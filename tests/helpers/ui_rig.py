@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -18,14 +19,19 @@ from viewer.app.main_view import MainView
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
 from viewer.panel import card, panel
+from viewer.panel.slider import RADIUS_PX
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
+from viewer.ui.context import LAYER_PADDING_PX, PANEL_PADDING_PX
 from viewer.ui.keys import NO_KEYS, Keys, Press
+from viewer.ui.tips import Box
 
 STEP_S = 1.0 / 60.0
-HEAD = 107.0  # height of the name's center on the top card
-TRACK = 131.0  # height of the slider's center on the top card
+SLIDER_INSET = PANEL_PADDING_PX[0] + LAYER_PADDING_PX[0] + RADIUS_PX
+"""Distance of a strength slider's ends from the panel's edges."""
+HEAD = 102.0  # height of the name's center on the top card
+TRACK = 127.0  # height of the slider's center on the top card
 BACKGROUND = (0.749, 0.847, 0.945)
 
 
@@ -50,6 +56,45 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
 
 
 _render = imgui.backends.opengl3_render_draw_data
+_ITEMS = (
+    *("button", "small_button", "invisible_button", "checkbox", "selectable", "menu_item"),
+    *("slider_float", "drag_int", "input_text", "input_text_with_hint", "color_button"),
+)
+"""Functions of imgui that draw the items which `item_box` finds."""
+
+
+def center(box: Box) -> tuple[float, float]:
+    """Return the center of a rectangle."""
+    return (box.left + box.right) / 2, (box.top + box.bottom) / 2
+
+
+def item_box(frame: Callable[[], None], name: str, number: int = 0) -> Box:
+    """Draw a frame; return the rectangle of an item in window coordinates.
+
+    Args:
+        frame: draws the frame
+        name: the item's text or its imgui id
+        number: number of the item among the visible ones of this name, in the order of drawing
+    """
+    found = list[Box]()
+
+    def recorded(draw: Callable[..., Any]) -> Callable[..., Any]:
+        def record(label: str, *args: Any, **kwargs: Any) -> Any:
+            result = draw(label, *args, **kwargs)
+            if name in (label, *label.split("##")) and imgui.is_item_visible():
+                low = imgui.get_item_rect_min()
+                high = imgui.get_item_rect_max()
+                found.append(Box(low.x, low.y, high.x, high.y))
+            return result
+
+        return record
+
+    with ExitStack() as stack:
+        for item in _ITEMS:
+            stack.enter_context(patch.object(imgui, item, recorded(getattr(imgui, item))))
+        frame()
+    assert number < len(found), f"item {name!r}: {len(found)} are visible"
+    return found[number]
 
 
 class Rig:
@@ -169,13 +214,21 @@ class Rig:
         wide = self.pixels[0] - round(panel.WIDTH_PX * self.pixels[0] / self.points[0])
         return read_rgb(self.screen, self.pixels)[:, :wide]
 
+    def box(self, name: str, number: int = 0) -> Box:
+        """Draw a frame; return the rectangle of an item, see `item_box`."""
+        return item_box(self.event, name, number)
+
+    def at(self, name: str, number: int = 0) -> tuple[float, float]:
+        """Draw a frame; return the center of an item in window coordinates, see `item_box`."""
+        return center(self.box(name, number))
+
     @property
     def strengths(self) -> list[float]:
         return [layer.strength for layer in self.main_view.work.view.layers]
 
     def slider(self, layer: int, strength: float) -> tuple[float, float]:
         """Return the window position (at 1×) of a layer's handle at a strength. The last layer is on top."""
-        inset = 12 + 10 + 7  # padding of the panel and the card, radius of the handle
+        inset = SLIDER_INSET
         span = panel.WIDTH_PX - 2 * inset
         row = len(self.main_view.work.view.layers) - 1 - layer
         return self.points[0] - panel.WIDTH_PX + inset + strength * span, TRACK + card.CARD_PX * row

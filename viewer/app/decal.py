@@ -28,7 +28,7 @@ from viewer.render.decal_surfaces import DecalSurfaces, unhidden_frame
 from viewer.state.transient import Decal, DecalGhost, DecalGrip, Transient
 from viewer.state.workspace import Workspace, with_transient
 from viewer.ui import overlay
-from viewer.ui.context import PALETTE, u32
+from viewer.ui.context import GAP_PX, PALETTE, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import accent_button, checkbox, plate, small, tip
@@ -515,7 +515,7 @@ def _draw_buttons(decal: Decal, pointer: PointerContext, surfaces: DecalSurfaces
     if frame is None or pointer.shown.has_tool:  # the options of a tool take the place of the buttons
         return decal, ""
     scale = pointer.ui.scale
-    at = (pointer.area.width / 2, 14.0 * scale)
+    at = (pointer.area.width / 2, GAP_PX * scale)
     request = ""
     with plate("placing", at, pointer.ui, (0.5, 0.0)):
         imgui.align_text_to_frame_padding()

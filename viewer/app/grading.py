@@ -250,7 +250,8 @@ class GradePreview:
         work = self._store.get()
         form = with_settings(work.form, text) if "\n" not in text else None
         if form is None:
-            raise ProgdfError(f"the clipboard has no settings of an edit, but '{text[:40]}'; copy some first")
+            content = f"the clipboard has no settings of an edit, but '{text[:40]}'"
+            raise ProgdfError(f"{content if text else 'the clipboard is empty'}; copy some settings first")
         form = replace(form, region=work.form.region, error="")
         self._store.replace(replace(work, form=form, form_open=True, form_opening=not work.form_open))
         self._store.wake()

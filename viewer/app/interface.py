@@ -16,7 +16,7 @@ from viewer.state.commands import Action, OnItem, Plain
 from viewer.state.transient import Pull
 from viewer.state.workspace import SceneFacts, Workspace
 from viewer.ui import key_list, overlay, tour_card
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.context import PALETTE, PANEL_PADDING_PX, SMALL_PX, UiContext, u32
 from viewer.ui.keys import COMMANDS, Command, Keys, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.search import find_commands
@@ -383,7 +383,7 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[Action
     display = imgui.get_io().display_size
     row = imgui.get_text_line_height_with_spacing()
     requests = list[Action]()
-    at = (display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
+    at = (display.x - PANEL_PADDING_PX[0] * ui.scale, display.y - 40.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (1.0, 1.0))
     with menu("history", ui) as is_open:
         count = len(history.entries(work.past))

@@ -23,7 +23,7 @@ from viewer.state.layers import (
 )
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Workspace, is_compact
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.context import LAYER_PADDING_PX, PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     card,
@@ -111,9 +111,9 @@ def _gain(
 
 TOGGLE_PX = 20.0  # side of a toggle, at 1×
 THUMBNAIL_PX = 24.0  # side of a thumbnail, at 1×
-CARD_PX = 66.0  # height of a card with the gap to the next one, at 1×
-COMPACT_PX = 7.0  # padding of a compact row, at 1×
-SLIDER_PX = 92.0  # width of the slider in a compact row or a group row, at 1×
+CARD_PX = 64.0  # height of a card with the gap to the next one, at 1×
+COMPACT_PX = 8.0  # padding of a compact row, at 1×
+SLIDER_PX = 80.0  # width of the slider in a compact row or a group row, at 1×
 SLIM_PX = 16.0  # height of this slider, at 1×
 BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
 BLEND_HELP = {
@@ -177,7 +177,7 @@ def draw_card(
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
     color = p.card_focused if selected else p.card
-    padding = (COMPACT_PX, 0.0) if compact else (10.0, 6.0)
+    padding = (COMPACT_PX, 0.0) if compact else LAYER_PADDING_PX
     with card("card", color, ui, padding=padding):
         right = right_edge()
         work, touch = _head(work, index, row, active, texture, ui, actions)

@@ -24,7 +24,7 @@ from viewer.state.layers import (
 )
 from viewer.state.view_state import LayerGroup, ViewState
 from viewer.state.workspace import Workspace, is_compact
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.context import HALF_GAP_PX, PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     accent_button,
@@ -82,7 +82,7 @@ def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
     if len(chosen) < 2:
         return 0.0
     spacing = imgui.get_style().item_spacing.y
-    return (SMALL_PX + 6.0 + MASTER_PX) * ui.scale + 3 * spacing
+    return float(imgui.get_frame_height() + MASTER_PX * ui.scale + 3 * spacing)
 
 
 def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[Action]) -> None:
@@ -91,13 +91,11 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
         return
     imgui.separator()
     right = right_edge()
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, (6.0 * ui.scale, 3.0 * ui.scale))
     imgui.align_text_to_frame_padding()
     small(f"{len(chosen)} layers", PALETTE.dim)
     imgui.same_line(right - imgui.get_frame_height())
     more_button("of layers", _BUTTONS, ui, actions)
     tip("Group, reset")
-    imgui.pop_style_var()
     value = master_strength(state, chosen)
     max_strength = largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
@@ -211,7 +209,7 @@ def _group_name(
     return corner, gesture
 
 
-HEADING_PX = 34.0  # height of the heading above the cards, at 1×
+HEADING_PX = 32.0  # height of the heading above the cards, at 1×
 _DRAGS = ("dragged", "dropped")
 INSET_PX = 10.0  # indentation of a group's layers, at 1×
 
@@ -365,7 +363,7 @@ def _group(state: ViewState, name: str, ui: UiContext, actions: list[Action]) ->
 def _tighten(work: Workspace, ui: UiContext) -> None:
     """Reduce the gap under compact rows."""
     if is_compact(work):
-        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - HALF_GAP_PX * ui.scale)
 
 
 def _drag(

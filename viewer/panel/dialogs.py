@@ -19,7 +19,7 @@ from progdf.terminal import escape_text
 from viewer.files.user_files import complete_path, path_completions
 from viewer.state.commands import Action, OnItem, Plain, RebindEdit, ReplaceEdit, Save, WithText
 from viewer.state.workspace import Dialog
-from viewer.ui.context import PALETTE, UiContext
+from viewer.ui.context import GAP_PX, PALETTE, UiContext
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import accent_button, elide, inert, small, tip, wrapped_text
 
@@ -127,14 +127,14 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
     """
     if not imgui.is_popup_open(_POPUP):
         imgui.open_popup(_POPUP)
-    margin = 8.0 * ui.scale
+    margin = GAP_PX * ui.scale
     top = max(margin, 0.25 * area.height - 90.0 * ui.scale)
     imgui.set_next_window_pos((area.width / 2, top), 0, (0.5, 0.0))
     imgui.set_next_window_size((min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
     flags = imgui.WindowFlags_
     flags_of_popup = flags.no_decoration.value | flags.no_saved_settings.value | flags.no_move.value
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, (16.0 * ui.scale, 14.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, (2 * GAP_PX * ui.scale, 2 * GAP_PX * ui.scale))
     imgui.push_style_color(imgui.Col_.modal_window_dim_bg, (0.0, 0.0, 0.0, 0.45))
     answer = DialogResult(dialog)
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:

@@ -29,7 +29,7 @@ from viewer.state.forms import (
     with_look,
 )
 from viewer.state.transient import GradeScope, LookShelf
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.context import HALF_GAP_PX, PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import (
     choice,
     icon_button,
@@ -170,11 +170,12 @@ def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext, actions: list[Action]
 
     A color table without settings becomes a layer, as the form has no settings for it.
     """
-    gap = 2.0 * ui.scale
+    gap = HALF_GAP_PX * ui.scale
     wide = (imgui.get_content_region_avail().x - (LOOK_COLUMNS - 1) * gap) / LOOK_COLUMNS
     side = (wide, wide * LOOK_PX[1] / LOOK_PX[0])
     canvas = imgui.get_window_draw_list()
     rows = -(-max(len(shelf.looks), 1) // LOOK_COLUMNS)
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (gap, gap))
     for i, (name, look) in enumerate(shelf.looks):
         row, place = divmod(i, LOOK_COLUMNS)
         if place:
@@ -207,6 +208,8 @@ def _looks(form: NewEdit, shelf: LookShelf, ui: UiContext, actions: list[Action]
             actions.append(WithText("open_file", look.removeprefix(CUBE_LOOK)))
         elif pressed:
             form = with_look(form, look)
+    imgui.pop_style_var()
+    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + gap)
     with inert(form.spec == "grade"):
         saves = imgui.button("Save as a look", imgui.ImVec2(-1.0, 0.0))
     tip("Keep this grade as a .cube file, named like the edit or after what it does")

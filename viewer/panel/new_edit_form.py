@@ -25,7 +25,7 @@ from viewer.state.forms import (
 from viewer.state.selection import SelectionState
 from viewer.state.transient import PreviewState
 from viewer.state.workspace import Workspace
-from viewer.ui.context import PALETTE, Icon, UiContext, u32
+from viewer.ui.context import HALF_GAP_PX, PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import COMMANDS, shortcut
 from viewer.ui.widgets import (
     accent_button,
@@ -304,11 +304,12 @@ def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
     """Draw a button for every style, with a thumbnail of this view once it is painted. The most consistent
     styles, `BEST_STYLES`, come first."""
     small(f"Painting {form.style}", PALETTE.text)
-    gap = 2.0 * ui.scale
+    gap = HALF_GAP_PX * ui.scale
     canvas = imgui.get_window_draw_list()
     wide = (imgui.get_content_region_avail().x - (SHEET_COLUMNS - 1) * gap) / SHEET_COLUMNS
     side = imgui.ImVec2(wide, wide * SHEET_PX[1] / SHEET_PX[0])
     rows = -(-len(STYLE_ORDER) // SHEET_COLUMNS)
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (gap, gap))
     for index, number in enumerate(STYLE_ORDER):
         row, column = divmod(index, SHEET_COLUMNS)
         if column:
@@ -327,6 +328,8 @@ def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
             canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
         best = "; consistent from all sides" if number in BEST_STYLES else ""
         tip(f"Painting {number}{best}")
+    imgui.pop_style_var()
+    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + gap)
     return form
 
 

@@ -19,7 +19,18 @@ from viewer.state.selection import NamedRegion
 from viewer.state.view_state import SceneState
 from viewer.state.workspace import REGIONS_OF_EDITS, UNSAVED, Layout, SceneFacts, Workspace, has_unsaved
 from viewer.ui import widgets
-from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.context import (
+    BEHIND,
+    FIXED,
+    GAP_PX,
+    HALF_GAP_PX,
+    PALETTE,
+    PANEL_PADDING_PX,
+    SMALL_PX,
+    Icon,
+    UiContext,
+    u32,
+)
 
 from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
@@ -47,6 +58,7 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
 
 WIDTH_PX = Layout.panel_px  # initial width, at 1×
 _EDGE_PX = 6.0
+_SCROLLBAR_INSET_PX = 6.0  # of the grab at both sides
 
 
 class Pictures(NamedTuple):
@@ -88,7 +100,9 @@ def draw(
     imgui.get_background_draw_list().push_clip_rect((0.0, 0.0), (display.x - wide, display.y))
     flags = imgui.WindowFlags_.no_scroll_with_mouse.value | imgui.WindowFlags_.no_background.value
     imgui.set_next_window_scroll((0.0, 0.0))  # keyboard focus would scroll title and footer, too
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*PANEL_PADDING_PX) * ui.scale)
     imgui.begin("panel", None, FIXED | BEHIND | flags | ui.nav_flags("panel"))
+    imgui.pop_style_var()
     ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
     _title(work, facts, ui, actions)
@@ -135,16 +149,20 @@ def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
 
 
 def _begin_body(footer: float, ui: UiContext) -> None:
-    """Begin the scrolling part. Its scrollbar lies in the panel's margin, so that the content never moves."""
+    """Begin the scrolling part. Its scrollbar fills the panel's margin, so that the content never moves."""
     overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
     clear = (0.0, 0.0, 0.0, 0.0)
     slots = (imgui.Col_.scrollbar_grab, imgui.Col_.scrollbar_grab_hovered, imgui.Col_.scrollbar_grab_active)
     for slot in () if overflows else slots:
         imgui.push_style_color(slot, clear)
     flags = imgui.WindowFlags_
-    wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
+    margin = PANEL_PADDING_PX[0] * ui.scale
+    imgui.push_style_var(imgui.StyleVar_.scrollbar_size, margin)
+    imgui.push_style_var(imgui.StyleVar_.scrollbar_padding, _SCROLLBAR_INSET_PX * ui.scale)
+    wide = imgui.get_content_region_avail().x + margin
     flags_of_body = flags.always_vertical_scrollbar.value | ui.nav_flags("panel")
     imgui.begin_child("body", (wide, -footer), ui.child_flags("panel"), flags_of_body)
+    imgui.pop_style_var(2)
     if not overflows:
         imgui.pop_style_color(len(slots))
 
@@ -162,12 +180,14 @@ def _title(work: Workspace, facts: SceneFacts, ui: UiContext, actions: list[Acti
     side = 24.0 * ui.scale
     scale = ui.scale
     room = imgui.get_content_region_avail().x
-    text = room - 3 * side - 8.0 * scale
+    text = room - 3 * side - GAP_PX * scale
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(GAP_PX, HALF_GAP_PX) * scale)
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         name = work.session or facts.title
         if has_unsaved(work):
             name = UNSAVED + name
         imgui.text(widgets.elide(name, text))
+    imgui.pop_style_var()
     size = f"{widgets.with_added(facts.count, facts.added)} splats"
     widgets.small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
     widgets.tip(f"{facts.title}\n{size}")
@@ -182,7 +202,7 @@ def _title(work: Workspace, facts: SceneFacts, ui: UiContext, actions: list[Acti
     imgui.same_line(0.0, 0.0)
     _menu_button(work.transient.recent, side, ui, actions)
     imgui.set_cursor_pos(below)
-    imgui.dummy((0.0, 2.0 * scale))
+    imgui.dummy((0.0, 1.0 * scale))
 
 
 SCENES = "Scenes"
@@ -344,6 +364,6 @@ def _footer(work: Workspace, ui: UiContext, actions: list[Action]) -> None:
     off = [name for name, change in changes.items() if not change]
     widgets.icon_row(steps, ui, actions, 8.0 * ui.scale, off=off)
     side = imgui.get_frame_height()
-    gap = 6.0 * ui.scale
+    gap = GAP_PX * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)
     widgets.icon_row(_FOOTER_BUTTONS, ui, actions, gap)

@@ -12,7 +12,7 @@ from viewer.state.commands import Action, ChooseSnapshot, MoveSnapshot, OnItem, 
 from viewer.state.snapshots import compare_sides, pair_of, with_original
 from viewer.state.workspace import Workspace
 from viewer.ui import widgets
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.context import GAP_PX, PALETTE, SMALL_PX, Icon, UiContext, u32
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -64,7 +64,7 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
     snapshots = with_original(work.snapshots, work.view)
     cards = _Cards([s.name for s in snapshots], textures, *pair_of(snapshots, work.view.pair))
     _pair(cards, compare_sides(work.snapshots, work.view) is not None, ui, actions)
-    gap = 6.0 * ui.scale
+    gap = GAP_PX * ui.scale
     each = (imgui.get_content_region_avail().x - (COLUMNS - 1) * gap) / COLUMNS
     for i in range(len(textures)):
         if i % COLUMNS:

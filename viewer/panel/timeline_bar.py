@@ -28,22 +28,22 @@ from viewer.state.timeline import (
 )
 from viewer.state.view_state import MAX_FPS, MAX_FRAME, Keyframe, Timeline
 from viewer.state.workspace import Workspace
-from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.context import GAP_PX, PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
-HEIGHT_PX = 46.0  # height of the bar, at 1×
-ROW_PX = 33.0  # height of the second line of a narrow bar
+HEIGHT_PX = 40.0  # height of the bar, at 1×
+ROW_PX = 32.0  # height of the second line of a narrow bar
 TRACK_PX = 20.0  # height of a row of keyframes
 _MAX_SHARE = 0.35  # maximum height of the rows, as a share of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
-SETTINGS_PX = 293.0  # width of the settings
-BUTTONS_PX = 143.0  # width of the buttons
+SETTINGS_PX = 285.0  # width of the settings
+BUTTONS_PX = 131.0  # width of the buttons
 _KEY_PX = 5.0  # half the size of a key
 _GRIP_PX = 8.0  # distance within which the mouse grabs a key
 _CURVE_PX = 3.0  # distance between two points of a curve
-_GAP_PX = 4.0  # gap under the rows
+_GAP_PX = 8.0  # gap under the rows
 _LABEL_STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
@@ -103,18 +103,18 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[Action, ...]:
     timeline = work.view.timeline
     actions = list[Action]()
     corner = (0.0, area.height - tall)
-    with plate("timeline", corner, ui, pad=10.0, size=(area.width, tall)):
+    with plate("timeline", corner, ui, size=(area.width, tall)):
         left = imgui.get_cursor_screen_pos().x
         keys = split_keys(timeline)
         _buttons(timeline, work.player, actions, ui)
-        imgui.same_line(BUTTONS_PX * scale + 10.0 * scale)
+        imgui.same_line((BUTTONS_PX + GAP_PX) * scale)
         settings = SETTINGS_PX * scale if roomy else 0.0
         wide = max(imgui.get_content_region_avail().x - settings, 40.0 * scale)
         start = left + (BUTTONS_PX + 8.0) * scale
         ruler = _Ruler(timeline, work.player, keys, start, max(wide - 16.0 * scale, 1.0), ui)
         _draw_ruler(ruler, wide, actions)
         if roomy:
-            imgui.same_line(0.0, 12.0 * scale)
+            imgui.same_line(0.0, GAP_PX * scale)
             _settings(work, ruler, actions)
         if work.player.unfolded:
             _rows(work, ruler, left, _rows_height(work, area, ui), actions)

@@ -28,7 +28,8 @@ def height(jobs: Sequence[JobCard], ui: UiContext) -> float:
     cards = (
         storage.get_float(imgui.get_id(_HEIGHT_SLOT)) if storage.get_bool(imgui.get_id(_OPEN_SLOT)) else 0.0
     )
-    return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
+    gaps = 3 if cards else 2
+    return float(STRIP_PX * ui.scale + gaps * imgui.get_style().item_spacing.y + cards)
 
 
 def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:

@@ -17,6 +17,14 @@ Rgba = tuple[float, float, float, float]
 FONT_PX = TEXT_PX  # at 1×
 SMALL_PX = 12.0
 
+# Spacing is a multiple of 8, or of 4 within a control. Pairs are horizontal and vertical, at 1×.
+GAP_PX = 8.0  # between controls, and from the window's edges
+HALF_GAP_PX = 4.0  # between parts of a control
+PANEL_PADDING_PX = (16.0, 8.0)
+CARD_PADDING_PX = (8.0, 8.0)  # also of menus, tooltips and plates over the picture
+LAYER_PADDING_PX = (8.0, 4.0)  # of a layer's card
+FRAME_PADDING_PX = (8.0, 4.0)  # of buttons and fields
+
 
 def _rgb(code: int, alpha: float = 1.0) -> Rgba:
     return (code >> 16 & 255) / 255, (code >> 8 & 255) / 255, (code & 255) / 255, alpha
@@ -199,11 +207,11 @@ def _apply_style(scale: float) -> None:
     style.font_size_base = FONT_PX
     style.font_scale_dpi = scale
     for name, (x, y) in {
-        "window_padding": (12, 10),
-        "frame_padding": (8, 5),
-        "item_spacing": (8, 6),
-        "item_inner_spacing": (6, 4),
-        "cell_padding": (6, 3),
+        "window_padding": CARD_PADDING_PX,
+        "frame_padding": FRAME_PADDING_PX,
+        "item_spacing": (GAP_PX, GAP_PX),
+        "item_inner_spacing": (GAP_PX, HALF_GAP_PX),
+        "cell_padding": (GAP_PX, HALF_GAP_PX),
     }.items():
         setattr(style, name, (x * scale, y * scale))
     for name, size in {

@@ -43,8 +43,8 @@ _BETWEEN = 0.7
 # at 1×
 COLUMN_PX = 248.0
 MAX_COLUMNS = 4
-_MARGIN_PX = 14.0
-_HEAD_PX = 36.0  # height of the title with the search field
+_MARGIN_PX = 16.0
+_HEAD_PX = 32.0  # height of the title with the search field
 _SEARCH_PX = 240.0
 
 

@@ -13,10 +13,11 @@ from viewer.state.commands import Action
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Message, Question
 
-from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .context import FONT_PX, GAP_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .tips import wrap
 from .widgets import plate
 
-_BANNER_PX = 14.0  # upper edge of a banner's text, at 1×
+_BANNER_PX = 12.0  # upper edge of a banner's text, at 1×
 _BANNER_SIDE_PX = 114.0  # free width at each side of a banner, for the toolbar and the axes
 _LINE_HEIGHT = 1.25  # distance of a banner's lines relative to the size of its text
 _UNDER_BAR_PX = 52.0  # the same below a bar at the picture's upper edge
@@ -37,7 +38,7 @@ def banner(text: str, area: Area, ui: UiContext, under_bar: bool = False) -> Non
         under_bar: a bar of the tool or of the comparison is there; the text goes below it
     """
     size = FONT_PX * ui.scale
-    pad = 8.0 * ui.scale
+    pad = GAP_PX * ui.scale
     room = area.width - 2 * _BANNER_SIDE_PX * ui.scale
     lines = wrap_words(text, room, lambda line: _text_width(line, size, ui))
     widths = [_text_width(line, size, ui) for line in lines]
@@ -136,7 +137,7 @@ def message(line: Message, area: Area, left: float, ui: UiContext) -> tuple[str,
         The clicked button ("close", "copy" for the details, "do" for the message's button, or ""), and the
         message's upper edge in window pixels.
     """
-    pad = 12.0 * ui.scale
+    pad = GAP_PX * ui.scale
     left = max(left, pad)
     buttons = {}
     if line.details:
@@ -179,16 +180,14 @@ def _line(
     ui: UiContext,
 ) -> tuple[str, float]:
     """Draw a plate with a text and its buttons; return the clicked one and the plate's upper edge."""
-    pad = 12.0 * ui.scale
+    pad = GAP_PX * ui.scale
     imgui.set_next_window_size_constraints((0.0, 0.0), (widest, imgui.get_io().display_size.y))
-    with plate(name, at, ui, pivot, 12.0):
+    with plate(name, at, ui, pivot):
         labels = {**buttons, "close": "×"}
         around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
         room = widest - 2 * pad - sum(imgui.calc_text_size(label).x + around for label in labels.values())
-        wrap = imgui.calc_text_size(text).x > room
-        with imgui_ctx.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0):
-            imgui.align_text_to_frame_padding()
-            imgui.text_colored(PALETTE.error if error else PALETTE.text, text)
+        imgui.align_text_to_frame_padding()
+        imgui.text_colored(PALETTE.error if error else PALETTE.text, wrap(text, room))
         clicked = ""
         for key, label in labels.items():
             imgui.same_line()
@@ -215,7 +214,7 @@ AXES_DRAG = "axes"
 # sizes at 1×
 LENGTH_PX = 34.0
 BALL_PX = 9.5
-MARGIN_PX = 10.0
+MARGIN_PX = 8.0
 LETTER_PX = 13.0
 MIN_PX = 240.0
 """Picture width below which the axes are hidden."""

@@ -11,10 +11,10 @@ from .context import PALETTE, SMALL_PX, UiContext
 from .keys import shortcut
 from .widgets import accent_button, plate
 
-WIDE_PX = 268.0
+WIDE_PX = 272.0
 """Width at 1×."""
 _EDGE_PX = 8.0  # distance from the picture's edges, at 1×
-_PAD_PX = 12.0  # padding, at 1×
+_PAD_PX = 16.0  # padding, at 1×
 _TEXTS = {
     "move": ("Move", "Drag in the picture to orbit. The right button pans, the wheel zooms."),
     "slide": ("Slide", "Drag a slider in the panel. At 0 is the original, at 1 the whole edit."),

@@ -14,7 +14,7 @@ from imgui_bundle import imgui, imgui_ctx
 from viewer.state.commands import Action
 from viewer.state.workspace import Layout
 
-from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
+from .context import BEHIND, CARD_PADDING_PX, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import COMMANDS, NUDGES, describe, shortcut
 from .search import jump_to
 from .tips import show_tip, wrap
@@ -39,10 +39,10 @@ def section(name: str, layout: Layout, ui: UiContext) -> Layout:
         pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
         color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
         canvas = imgui.get_window_draw_list()
-        canvas.add_text((round(x + step), round(y + 6.0 * ui.scale)), color, text)
+        canvas.add_text((round(x + step), round(y + 5.0 * ui.scale)), color, text)
     folded = layout.folded
     arrow = Icon.FOLDED if name in folded else Icon.UNFOLDED
-    canvas.add_text((round(x), round(y + 5.0 * ui.scale)), color, arrow)
+    canvas.add_text((round(x), round(y + 4.0 * ui.scale)), color, arrow)
     if not pressed:
         return layout
     others = tuple(other for other in folded if other != name)
@@ -97,7 +97,7 @@ def inert(when: bool) -> Iterator[None]:
 
 @contextmanager
 def card(
-    name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = (10.0, 8.0)
+    name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = CARD_PADDING_PX
 ) -> Iterator[None]:
     """Draw the enclosed items on a card of their height. `nav`: the keyboard navigates within it."""
     imgui.push_style_color(imgui.Col_.child_bg, color)
@@ -118,7 +118,7 @@ def plate(
     at: imgui.ImVec2Like,
     ui: UiContext,
     pivot: tuple[float, float] = (0.0, 0.0),
-    pad: float = 8.0,
+    pad: float = CARD_PADDING_PX[0],
     size: imgui.ImVec2Like | None = None,
 ) -> Iterator[None]:
     """Draw the enclosed items on a plate over the picture. `size` None fits the content."""
@@ -335,7 +335,7 @@ def search_field(hint_: str, query: str) -> str:
 @contextmanager
 def menu(name: str, ui: UiContext, flags: int = 0) -> Iterator[bool]:
     """Draw the context menu that `imgui.open_popup(name)` opens; yield whether it is open."""
-    imgui.push_style_var(imgui.StyleVar_.window_padding, (8.0 * ui.scale, 8.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*CARD_PADDING_PX) * ui.scale)
     is_open = imgui.begin_popup(name, flags)
     imgui.pop_style_var()
     yield bool(is_open)  # after an exception, `UiContext.guard` closes the open items
@@ -546,7 +546,7 @@ def choice(
         widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
     with imgui_ctx.begin_group():
-        imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, 5.0 * ui.scale))
+        imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, imgui.get_style().frame_padding.y))
         for i, (option, text) in enumerate(options.items()):
             if i:
                 imgui.same_line(0.0, gap)

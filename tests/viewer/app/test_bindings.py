@@ -183,7 +183,7 @@ def test_click_beside_the_palette_closes_it_and_on_a_line_runs_it() -> None:
         assert hand.main_view.work.palette is None
         hand.key("F3")
         type_text(hand, "ground")
-        hand.click(300.0, 134.0)
+        hand.click(*hand.at("grid"))
         assert hand.main_view.work.view.grid
 
 
@@ -202,14 +202,12 @@ def test_key_list_is_searched_and_closed_by_its_button() -> None:
     with rig(None, (1024, 640)) as hand:
         hand.key("F1")
         assert not hand.io.want_text_input, "keys stay active"
-        window = shown(hand)
-        corner = window.pos.x + window.size.x - 27.0, window.pos.y + 27.0
-        hand.click(corner[0] - 100.0, corner[1])
+        hand.click(*hand.at("##search keys"))
         type_text(hand, "shrink")
         assert hand.main_view.work.help_query == "shrink"
         assert [topic.name for topic in key_list.find_rows("shrink")] == ["Select"]
         assert key_list.find_rows("brush ctrl") == ()
-        hand.click(*corner)
+        hand.click(*hand.at("close"))
         assert not hand.main_view.work.help
         hand.key("F1")
         assert not hand.main_view.work.help_query

@@ -13,6 +13,7 @@ from tests.helpers.null_app import null_app
 from tests.helpers.ui_rig import TRACK, Rig, bear, first_view
 from viewer.app import app as application
 from viewer.files.document import Document
+from viewer.panel import panel
 from viewer.ui.window import DoubleClicks
 
 pytestmark = pytest.mark.gl
@@ -61,7 +62,7 @@ def test_window_records_the_arrival_time_of_a_press(opened: application.App) -> 
     from viewer.ui.window import glfw
 
     handle = ctypes.cast(opened.window.handle, ctypes.c_void_p).value or 0
-    glfw.set_cursor_pos(opened.window.handle, 900 - 300 + 29 + 0.5 * 242, TRACK)  # the upper slider's handle
+    glfw.set_cursor_pos(opened.window.handle, 900 - panel.WIDTH_PX / 2, TRACK)  # the upper slider's handle
     for _ in range(3):
         opened.draw()
     for action in (1, 0, 1, 0):

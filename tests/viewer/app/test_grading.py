@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imgui_bundle import imgui
 
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import opened_document
@@ -63,3 +64,11 @@ def test_look_without_a_name_is_named_after_its_effects(
     app.store.replace(replace(app.main_view.work, form=form))
     app.handle(Plain("save_look"))
     assert (tmp_path / "looks" / "evening.cube").is_file()
+
+
+def test_paste_from_an_empty_clipboard_says_so(app: App, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imgui, "get_clipboard_text", lambda: "")
+    app.handle(Plain("paste_edit"))
+    message = app.main_view.work.message
+    assert message is not None
+    assert message.text == "the clipboard is empty; copy some settings first"

@@ -12,6 +12,7 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
+from viewer.panel import panel
 from viewer.state.commands import Plain
 from viewer.state.forms import DeliverOptions
 from viewer.state.selection import NamedRegion
@@ -216,7 +217,7 @@ def test_no_shortcut_acts_while_a_menu_or_form_is_open(hand: Rig, what: str) -> 
     if what == "list":
         hand.click(*LIST)
     if what == "menu":
-        hand.click(WINDOW[0] - 24.0, 24.0)
+        hand.click(*hand.at(panel.MENU_ID))
     if what == "question":
         hand.main_view.messages.ask(Dialog("about", "1.0"))
         hand.frame(2)

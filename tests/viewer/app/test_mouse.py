@@ -10,8 +10,9 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
 from viewer.camera.view_camera import axes, eye, fit_subject
+from viewer.panel import panel
 from viewer.state.view_state import LayerState
-from viewer.ui.context import PALETTE
+from viewer.ui.context import PALETTE, PANEL_PADDING_PX
 from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
@@ -173,7 +174,8 @@ def test_layer_focused_by_key_is_scrolled_into_view() -> None:
         hand.key("9")
         hand.frame(5)
         accent = np.round(np.array(PALETTE.accent[:3]) * 255)
-        edge = np.abs(hand.image()[60:480, 353] - accent).max(axis=-1) <= 2
+        left = round(hand.points[0] - panel.WIDTH_PX + PANEL_PADDING_PX[0]) + 1
+        edge = np.abs(hand.image()[60:480, left] - accent).max(axis=-1) <= 2
         assert edge.sum() > 50, "the whole card of the focused layer is in sight"
         hand.key("Shift+9")
         assert not hand.main_view.work.view.layers[0].enabled

@@ -108,25 +108,22 @@ def test_six_layers_have_whole_cards_without_scrolling() -> None:
 
 
 def test_comparison_pill_shows_the_original_and_splits_the_view(hand: Rig) -> None:
-    pill = window_at("comparison")
-    y = pill.pos.y + 16.0
-    left = pill.pos.x
-    hand.click(left + 30.0, y)
+    hand.click(*hand.at("left"))
     assert hand.main_view.work.before
-    hand.click(left + 110.0, y)
+    hand.click(*hand.at("right"))
     assert not hand.main_view.work.before
-    hand.click(left + 72.0, y)
+    hand.click(*hand.at("split"))
     assert hand.main_view.work.view.compare.mode == "split"
-    hand.click(left + 72.0, y)
+    hand.click(*hand.at("split"))
     assert hand.main_view.work.view.compare.mode == "off"
 
 
 def test_sections_fold_and_open(hand: Rig) -> None:
-    hand.click(LEFT + 40.0, 71.0)
+    hand.click(*hand.at("section Edits"))
     assert "Edits" in hand.main_view.work.layout.folded
     hand.click(LEFT + 100.0, HEAD + card.CARD_PX)
     assert hand.main_view.work.focus == 1, "no card is there"
-    hand.click(LEFT + 40.0, 71.0)
+    hand.click(*hand.at("section Edits"))
     assert "Edits" not in hand.main_view.work.layout.folded
 
 
@@ -157,8 +154,6 @@ def test_layout_is_remembered(tmp_path: Path) -> None:
 
 
 def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
-    strip = (LEFT + 150.0, SIZE[1] - 37.0 - 14.0)
-
     def cards() -> int:
         hand.frame(3)
         return sum(
@@ -169,9 +164,9 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
         replace(hand.main_view.work, jobs=(JobCard(1, "Film film.mp4", Path("/scenes/film.mp4"), "running"),))
     )
     assert cards() == 0
-    hand.click(*strip)
+    hand.click(*hand.at("strip"))
     assert cards() == 1
-    hand.click(*strip)
+    hand.click(*hand.at("strip"))
     assert cards() == 0
     hand.main_view.store.replace(
         replace(
@@ -180,7 +175,7 @@ def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:
         )
     )
     assert cards() == 1
-    hand.click(*strip)
+    hand.click(*hand.at("strip"))
     assert cards() == 0, "what was seen does not open it again"
 
 

@@ -12,7 +12,7 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import ViewCamera, first_camera, fit_subject, with_up
 from viewer.files import user_files
 from viewer.files.document import Document
-from viewer.panel import panel, timeline_bar
+from viewer.panel import panel
 from viewer.state import workspace
 from viewer.state.workspace import Dialog, with_transient
 from viewer.ui import overlay
@@ -60,10 +60,9 @@ def test_timeline_controls_stay_in_a_narrow_window(points: tuple[int, int]) -> N
         (bar,) = windows("timeline")
         assert bar.pos.y + bar.size.y <= points[1]
         assert bar.content_size.x <= bar.size.x
-        y = points[1] - timeline_bar.ROW_PX + 6.0
-        hand.click(30.0, y)
+        hand.click(*hand.at("easing"))
         assert hand.main_view.work.view.timeline.keys[0].easing == "linear"
-        hand.click(92.0, y)
+        hand.click(*hand.at("ping_pong"))
         assert hand.main_view.work.view.timeline.ping_pong
 
 

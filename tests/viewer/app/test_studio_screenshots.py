@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,6 @@ from viewer.ui.splash import MINIMUM_SIZE_PX
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
-FOOT_Y = 550  # y of the buttons on a run's card
 pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
@@ -163,12 +163,9 @@ def test_second_click_on_the_stop_button_resumes(software_gpu: None) -> None:
             hand.click(x, y)
             return hand.main_view.take_requests()
 
-        stops = [
-            (x, y)
-            for x in range(SMALLEST[0] - 90, SMALLEST[0] - 10, 12)
-            for y in (FOOT_Y - 5, FOOT_Y + 3)
-            if asked(running, x, y) == (OnItem("stop_run", 1),)
-        ]
-        assert len(stops) >= 4
+        box = hand.box("stop_run")
+        corners = itertools.product((box.left + 2.0, box.right - 2.0), (box.top + 2.0, box.bottom - 2.0))
+        stops = [corner for corner in corners if asked(running, *corner) == (OnItem("stop_run", 1),)]
+        assert len(stops) == 4
         found = {asked(replace(running, status="stopped"), x, y) for x, y in stops}
         assert found == {(OnItem("resume_run", 1),)}

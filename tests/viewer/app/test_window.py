@@ -18,7 +18,7 @@ from PIL import Image
 from benchmarks.viewer.display import display, missing_tools
 from progdf.__main__ import main
 from tests.helpers.paths import ROOT
-from tests.helpers.ui_rig import TRACK, bear
+from tests.helpers.ui_rig import SLIDER_INSET, TRACK, bear
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files.session import open_session
 from viewer.panel import card, panel
@@ -147,8 +147,7 @@ def desktop(screen: str, tmp_path: Path) -> Iterator[Desktop]:
 
 def slider(layer: int, strength: float) -> tuple[float, float]:
     """Return the window position of a strength; the last of two layers is on top."""
-    inset = 12 + 10 + 7
-    x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
+    x = WIDTH - panel.WIDTH_PX + SLIDER_INSET + strength * (panel.WIDTH_PX - 2 * SLIDER_INSET)
     return x, TRACK + card.CARD_PX * (1 - layer)
 
 

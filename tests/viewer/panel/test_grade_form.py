@@ -9,8 +9,8 @@ import pytest
 from imgui_bundle import imgui
 
 from progdf.color.edits import parse_color
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.panel import grade_form, new_edit_form, panel
+from tests.helpers.ui_rig import Rig, bear, center, first_view, rig
+from viewer.panel import grade_form, panel
 from viewer.state.forms import EDITORS, NewEdit, parse_curve
 
 pytestmark = pytest.mark.gl
@@ -21,9 +21,6 @@ FORM = NewEdit(
     palette=tuple((color, color) for color in COLORS),
     folded=("Looks", "Light", "Color", "Palette", "Wheels"),
 )
-SWATCH_Y = 397.0  # with an open palette
-CURVE_TOP = 477.0  # of a curve below folded sections
-LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
 
 
 @pytest.fixture
@@ -39,12 +36,10 @@ def form(hand: Rig) -> NewEdit:
 
 
 def test_curve_points_are_added_dragged_and_removed_by_mouse(hand: Rig) -> None:
-    tall = grade_form.CURVE_PX
-    wide = WINDOW[0] - 22.0 - LEFT
-    top = CURVE_TOP
+    box = hand.box("curve")
 
     def place(x: float, y: float) -> tuple[float, float]:
-        return LEFT - 10.0 + x * wide, top + (1.0 - y) * tall
+        return box.left + x * (box.right - box.left), box.bottom - y * (box.bottom - box.top)
 
     hand.drag(place(0.3, 0.3), place(0.3, 0.15))
     ((x, y),) = parse_curve(form(hand).curves[0])
@@ -67,7 +62,7 @@ def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
             hand.modifier(getattr(imgui.Key, name), False)
         return parse_curve(form(hand).curves[0])
 
-    hand.click(LEFT + 40.0, CURVE_TOP + grade_form.CURVE_PX + 18.0)  # the name field below the curve
+    hand.click(*hand.at("##text of Name"))  # below the curve
     hand.modifier(imgui.Key.mod_shift)
     strike("tab")
     hand.modifier(imgui.Key.mod_shift, False)
@@ -80,8 +75,6 @@ def test_curve_can_be_edited_by_keys_alone(hand: Rig) -> None:
 
 
 def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> None:
-    y = SWATCH_Y
-    x = LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
     hand.main_view.store.replace(
         replace(
@@ -90,11 +83,12 @@ def test_swatch_opens_a_picker_and_right_click_resets_its_color(hand: Rig) -> No
         )
     )
     hand.frame(2)
-    hand.move(x, y)
+    swatch = hand.at("##color 0")
+    hand.move(*swatch)
     hand.press(1)
     hand.release(1)
     assert form(hand).palette == FORM.palette
-    hand.click(x, y)
+    hand.click(*swatch)
     hand.frame(2)
     assert len(imgui.get_current_context().open_popup_stack) == 1
 
@@ -120,22 +114,21 @@ def test_wheel_follows_a_drag_and_a_double_click_resets_it(hand: Rig) -> None:
     opened = replace(FORM, folded=("Looks", "Light", "Color", "Palette", "Curve"))
     hand.main_view.store.replace(replace(hand.main_view.work, form=opened))
     hand.frame(2)
-    wide = (WINDOW[0] - 22.0 - (LEFT - 10.0 - new_edit_form.COLUMN_PX) - 16.0) / 3
-    center = LEFT - new_edit_form.COLUMN_PX + wide / 2, 431.0 + wide / 2
-    hand.drag((center[0] - 20.0, center[1]), (center[0], center[1] - 0.25 * wide))
+    box = hand.box("wheel shadows")
+    x, y = center(box)
+    hand.drag((x - 20.0, y), (x, y - 0.25 * (box.right - box.left)))
     shadows, midtones, _ = form(hand).wheels
     assert shadows.hue == pytest.approx(90.0, abs=15.0)
     assert 0.3 < shadows.amount < 0.9
     assert not midtones.amount
     assert "wheel_shadows=" in form(hand).spec
     for _ in range(2):
-        hand.click(*center)
+        hand.click(x, y)
     assert form(hand).spec == "grade"
 
 
 def test_fast_drag_that_ends_within_a_frame_moves_the_point(hand: Rig) -> None:
-    x = LEFT + 40.0
-    y = CURVE_TOP + 40.0
+    x, y = hand.at("curve")
     imgui.set_nav_cursor_visible(True)  # as after opening the form by keys
     hand.move(x, y)
     hand.press()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 from imgui_bundle import imgui
 
-from tests.helpers.ui_rig import HEAD, TRACK
+from tests.helpers.ui_rig import HEAD, SLIDER_INSET, TRACK, center, item_box
 from viewer.camera.view_camera import Bounds, ViewCamera, axes
 from viewer.panel import card, panel, view_settings
 from viewer.panel.slider import parse_strength
@@ -64,6 +64,10 @@ class Hand:
         self.button(False)
         self.frame()
 
+    def click_item(self, name: str, number: int = 0) -> None:
+        x, y = center(item_box(self.frame, name, number))
+        self.click(x / self.ui.scale, y / self.ui.scale)
+
     def hold(self, key: imgui.Key, down: bool) -> None:
         imgui.get_io().add_key_event(key, down)
         self.frame()
@@ -99,8 +103,8 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 
 
 LEFT = SIZE[0] - panel.WIDTH_PX
-START = LEFT + 12 + 10 + 7
-SPAN = panel.WIDTH_PX - 2 * (12 + 10 + 7)
+START = LEFT + SLIDER_INSET
+SPAN = panel.WIDTH_PX - 2 * SLIDER_INSET
 TRACKS = (TRACK + card.CARD_PX, TRACK)  # heights of the two sliders' tracks; the last layer lies on top
 EYES = (HEAD + card.CARD_PX, HEAD)
 
@@ -232,7 +236,7 @@ def test_click_on_the_number_types_a_value(hand: Hand) -> None:
 
 
 def test_eye_hides_only_its_layer(hand: Hand) -> None:
-    hand.click(LEFT + 34, EYES[1])
+    hand.click_item("eye")
     assert [layer.enabled for layer in hand.work.view.layers] == [True, False]
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.work.past.past) == 1
@@ -246,31 +250,30 @@ def test_click_on_a_card_focuses_it(hand: Hand) -> None:
 
 
 def test_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> None:
-    hand.click(SIZE[0] - 25, 70)
-    place = imgui.get_current_context().open_popup_stack[0].window.pos / hand.ui.scale
-    hand.click(place.x + 40, place.y + 8 + 21 + 1.5 * 40)
+    hand.click_item("about layers")
+    hand.click_item("##Add")
     assert hand.work.view.blend == "sum"
     assert perform(hand.work, Plain("undo"), FACTS).view == STACK
 
 
 def test_buttons_request_the_same_actions_as_keys(hand: Hand) -> None:
-    hand.click(SIZE[0] - 25, SIZE[1] - 22)
-    hand.click(SIZE[0] - 55, SIZE[1] - 22)
+    hand.click_item("help")
+    hand.click_item("picture")
     assert hand.actions == [Plain("help"), Plain("picture")]
 
 
 def test_undo_button_is_disabled_without_history(hand: Hand) -> None:
-    hand.click(LEFT + 24, SIZE[1] - 22)
+    hand.click_item("undo")
     assert hand.actions == []
     hand.click(at(0.3), TRACKS[1])
-    hand.click(LEFT + 24, SIZE[1] - 22)
+    hand.click_item("undo")
     assert hand.actions == [Plain("undo")]
 
 
 def test_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
-    hand.click(LEFT - 24, 129)
-    hand.click(LEFT - 76, 263)
+    hand.click_item("view")
+    hand.click_item("−Z")
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
     assert history.next_undo(hand.work.past) == "up axis"
     hand.ui.close()
@@ -279,8 +282,8 @@ def test_up_axis_button_rolls_the_camera_upright() -> None:
 def test_up_direction_of_the_view_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
     before = axes(hand.work.view.camera)
-    hand.click(LEFT - 24, 129)
-    hand.click(LEFT - 38, 263)
+    hand.click_item("view")
+    hand.click_item("View")
     after = axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):

@@ -13,6 +13,7 @@ from tests.helpers.count import Count
 from tests.helpers.stacks import EDITS, many_edits
 from tests.helpers.ui_rig import Rig, bear, rig
 from viewer.panel import panel
+from viewer.panel.slider import RADIUS_PX
 from viewer.state import layer_selection
 from viewer.state.view_state import LayerGroup
 
@@ -20,12 +21,15 @@ pytestmark = pytest.mark.gl
 SIZE = (1024, 800)
 LEFT = SIZE[0] - panel.WIDTH_PX
 # center of the first compact row, and the distance between rows
-TOP = 132.0
-STEP = 28.0
+TOP = 130.0
+STEP = 27.0
 NAME = LEFT + 90.0
-TRACK = LEFT + 166.5
-SPAN = 78.0
-MASTER = (LEFT + 12.0 + 7.0, 740.0, 219.0)  # start of its track, and the track's length
+
+
+def track(hand: Rig, name: str, strength: float) -> float:
+    """Return the x of a strength on the first slider of this imgui id."""
+    box = hand.box(name)
+    return box.left + RADIUS_PX + strength * (box.right - box.left - 2 * RADIUS_PX)
 
 
 def row(layer: int, count: int = len(EDITS)) -> float:
@@ -62,11 +66,10 @@ def test_strengths_of_twenty_compact_rows_move_together(
     stack, view = many_edits(bear())
     with rig(view, SIZE, stack=stack) as hand:
         assert not hand.main_view.work.cards_fit
-        hand.click(TRACK + 0.25 * SPAN, row(0))
+        hand.click(track(hand, "##strength", 0.25), row(0))
         assert hand.strengths[0] == pytest.approx(0.25, abs=0.01), "the last row is in reach"
-        hand.click(SIZE[0] - 25.0, 70.0)
-        place = imgui.get_current_context().open_popup_stack[0].window.pos
-        hand.click(place.x + 40.0, place.y + 8.0 + 21.0 + 1.5 * 40.0)
+        hand.click(*hand.at("about layers"))
+        hand.click(*hand.at("##Add"))
         assert hand.main_view.work.view.blend == "sum", "and so is the blend rule"
         hand.click(NAME, row(0))
         click_with(hand, imgui.Key.mod_shift, NAME, row(19))
@@ -76,15 +79,16 @@ def test_strengths_of_twenty_compact_rows_move_together(
         assert selected(hand) == [order(hand)[2]], "a click on one of them selects it alone"
         hand.click(NAME, row(0))
         click_with(hand, imgui.Key.mod_shift, NAME, row(19))
-        start = (MASTER[0] + 0.5 * MASTER[2], MASTER[1])
+        _, y = hand.at("##master")
+        start = (track(hand, "##master", 0.5), y)
         composed = Count(monkeypatch, Composer, "update")
         drawn = hand.main_view.canvas.pictures_drawn
         hand.move(*start)
         hand.press()
         for share in (0.45, 0.3, 0.6, 0.8):
-            hand.move(MASTER[0] + share * MASTER[2], MASTER[1])
+            hand.move(track(hand, "##master", share), y)
         hand.release()
-        assert hand.strengths == pytest.approx([0.4, *[0.8] * 19], abs=0.01), "in proportion"
+        assert hand.strengths == pytest.approx([0.4, *[0.8] * 19], abs=0.02), "in proportion"
         assert composed.calls == 4, "once per change"
         assert hand.main_view.canvas.pictures_drawn == drawn + 4
         assert len(hand.main_view.work.past.past) == entries + 1
@@ -96,7 +100,7 @@ def test_strengths_of_twenty_compact_rows_move_together(
         hand.key("Alt+G")
         click_with(hand, imgui.Key.mod_ctrl, NAME, row(3))
         assert selected(hand) == [EDITS[0], EDITS[3]]
-        hand.click(TRACK + 0.7 * SPAN, row(3))
+        hand.click(track(hand, "##strength", 0.7), row(3))
         assert len(selected(hand)) == 2, "a slider moves alone and leaves the selection"
         assert hand.strengths[3] == pytest.approx(0.7, abs=0.01)
         entries = len(hand.main_view.work.past.past)
@@ -115,14 +119,14 @@ def test_strengths_of_twenty_compact_rows_move_together(
         hand.key("Ctrl+G")
         hand.click(NAME, row(0) + STEP)
         click_with(hand, imgui.Key.mod_ctrl, NAME, row(1) + STEP)
-        hand.click(TRACK + 0.9 * SPAN, MASTER[1] - 64.0)
+        hand.click(track(hand, "##strength", 0.9), hand.at("##strength", -1)[1])
         assert hand.strengths[0] == pytest.approx(0.9, abs=0.01), "the bar hides no row that is selected"
 
 
 def test_search_finds_names_and_regions_and_reset_covers_selection() -> None:
     stack, view = many_edits(bear(), 12)
     with rig(view, SIZE, stack=stack) as hand:
-        hand.click(TRACK + 0.9 * SPAN, row(11, 12))
+        hand.click(track(hand, "##strength", 0.9), row(11, 12))
         hand.key("Ctrl+F")
         type_text(hand, "TANK", imgui.Key.enter)
         assert hand.main_view.work.search == "TANK"
@@ -149,7 +153,7 @@ def test_group_is_created_folded_dimmed_and_dissolved_in_the_panel() -> None:
         hand.key("Ctrl+G")
         assert hand.main_view.work.view.groups == (LayerGroup("Group"),)
         assert np.array_equal(hand.picture(), bright), "a group changes nothing by itself"
-        hand.click(TRACK + 0.5 * SPAN, TOP)
+        hand.click(track(hand, "##factor", 0.5), TOP)
         assert hand.main_view.work.view.groups[0].strength == pytest.approx(0.5, abs=0.03)
         assert not np.array_equal(hand.picture(), bright)
         hand.click(LEFT + 20.0, TOP)

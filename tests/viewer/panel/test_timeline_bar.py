@@ -19,7 +19,7 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.io.atomic import temporary_subfolder
 from tests.helpers.full_disk import files_up_to
-from tests.helpers.ui_rig import STEP_S, Rig, bear, first_view, rig
+from tests.helpers.ui_rig import STEP_S, Rig, bear, center, first_view, rig
 from viewer.files import document, session
 from viewer.files.session import WindowSession
 from viewer.panel import panel, timeline_bar
@@ -54,10 +54,10 @@ def hand(tmp_path: Path) -> Iterator[Rig]:
 
 def at(hand: Rig, frame: float) -> tuple[float, float]:
     """Return the window position of a frame on the ruler."""
-    left = 10.0 + timeline_bar.BUTTONS_PX
-    wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar.SETTINGS_PX
+    box = hand.box("ruler")
     shown = hand.main_view.work.view.timeline
-    return timeline_bar.place(shown, frame, left + 8.0, wide - 16.0), WINDOW[1] - 24.0
+    x = timeline_bar.place(shown, frame, box.left + 8.0, box.right - box.left - 16.0)
+    return x, center(box)[1]
 
 
 def frames_of(hand: Rig) -> list[int]:
@@ -137,31 +137,21 @@ def test_comma_and_period_step_and_with_shift_jump_between_keys(hand: Rig) -> No
 
 
 def test_buttons_of_the_bar_work(hand: Rig) -> None:
-    y = WINDOW[1] - 24.0
-    gap = 27.0
     hand.drag(at(hand, 30), at(hand, 30))
-    for x, expected in ((22.0 + 2 * gap, [0, 20, 30]), (22.0 + 3 * gap, [0, 20])):
-        hand.move(x, y)
-        hand.press()
-        hand.release()
+    for button, expected in (("key", [0, 20, 30]), ("drop_key", [0, 20])):
+        hand.click(*hand.at(button))
         assert frames_of(hand) == expected
-    hand.move(22.0 + gap, y)
-    hand.press()
-    hand.release()
+    hand.click(*hand.at("play"))
     assert hand.main_view.work.player.playing
     hand.key("Space")
-    settings = WINDOW[0] - panel.WIDTH_PX - 10.0 - timeline_bar.SETTINGS_PX + 12.0
-    hand.move(settings + 30.0, y)
-    hand.press()
-    hand.release()
+    hand.click(*hand.at("easing"))
     assert hand.main_view.work.view.timeline.keys[0].easing != keyed().timeline.keys[0].easing or (
         hand.main_view.work.view.timeline.keys[1].easing != "linear"
     )
-    hand.move(settings + 80.0, y)
-    hand.press()
-    hand.release()
+    hand.click(*hand.at("ping_pong"))
     assert hand.main_view.work.view.timeline.ping_pong
-    hand.drag((settings + 120.0, y), (settings + 160.0, y))
+    x, y = hand.at("length")
+    hand.drag((x, y), (x + 40.0, y))
     assert hand.main_view.work.view.timeline.length > 40
 
 
@@ -219,7 +209,7 @@ def test_bar_and_film_agree_on_the_number_of_frames(hand: Rig, monkeypatch: pyte
 
 def test_drag_on_the_bar_does_not_orbit_the_camera(hand: Rig) -> None:
     camera = hand.main_view.work.view.camera
-    hand.drag((300.0, WINDOW[1] - 44.0), (380.0, WINDOW[1] - 44.0))
+    hand.drag((300.0, WINDOW[1] - 4.0), (380.0, WINDOW[1] - 4.0))
     assert hand.main_view.work.view.camera == camera
 
 

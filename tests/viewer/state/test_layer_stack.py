@@ -51,7 +51,6 @@ from viewer.state.workspace import original
 
 POINTS = (700, 640)
 LEFT = POINTS[0] - panel.WIDTH_PX
-TOGGLES = {"solo": 70.0, "lock": 90.0, "fold": 110.0, "paint": 130.0, "menu": 150.0}  # from the right edge
 THREE = ViewState(layers=(LayerState(0, "a", 0.5), LayerState(1, "b", 0.5), LayerState(2, "c", 0.5)))
 
 
@@ -68,7 +67,9 @@ def click(hand: Rig, x: float, y: float) -> None:
 
 
 def toggle(hand: Rig, name: str, layer: int) -> None:
-    click(hand, POINTS[0] - TOGGLES[name], HEAD + row(layer))
+    y = HEAD + row(layer)
+    hand.move(LEFT + 150, y)  # a hovered card has toggles
+    click(hand, hand.at(name)[0], y)
 
 
 def row(layer: int) -> float:
@@ -230,7 +231,7 @@ def test_card_toggles_change_only_their_own_layer(hand: Rig, name: str, field: s
 
 def test_alt_click_on_an_eye_shows_only_its_layer(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_alt)
-    click(hand, LEFT + 34, HEAD + row(1))
+    click(hand, *hand.at("eye"))
     hand.modifier(imgui.Key.mod_alt, False)
     assert [(layer.enabled, layer.solo) for layer in layers(hand)] == [(True, False), (True, True)]
 
@@ -253,7 +254,7 @@ def test_locked_slider_does_not_move(hand: Rig) -> None:
     toggle(hand, "lock", 0)
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
     assert hand.strengths == [0.5, 0.5]
-    click(hand, POINTS[0] - 40, HEAD + row(0))
+    click(hand, POINTS[0] - 44, HEAD + row(0))
     hand.frame(2)
     assert not imgui.get_io().want_text_input
 
@@ -261,7 +262,7 @@ def test_locked_slider_does_not_move(hand: Rig) -> None:
 def test_gain_dragged_in_the_fold_scales_only_its_kind(hand: Rig) -> None:
     toggle(hand, "fold", 1)
     before = hand.main_view.engine.gaussians(hand.main_view.work.view).sh0.clone()
-    y = 188.0 + row(1)  # the first gain
+    _, y = hand.at("##geometry")
     hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
     assert layers(hand)[1].gains == Gains(geometry=0.0)
     assert len(hand.main_view.work.past.past) == 1
@@ -421,13 +422,13 @@ def test_sweep_of_a_layer_hidden_by_solo_is_refused(
     assert "ears is shown alone and hides it; show scarf alone too" in capsys.readouterr().err
 
 
-def menu(hand: Rig, layer: int, item: int) -> None:
-    """Right-click a layer's card and pick an item by index; 6 is Delete."""
+def menu(hand: Rig, layer: int, command: str) -> None:
+    """Right-click a layer's card and pick a command."""
     hand.pause(0.5)
     hand.move(LEFT + 150, HEAD + row(layer))
     hand.press(1)
     hand.release(1)
-    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 6 else 0.0))
+    click(hand, *hand.at(command))
 
 
 def test_top_card_is_the_top_layer(hand: Rig) -> None:
@@ -447,7 +448,7 @@ def test_top_card_is_the_top_layer(hand: Rig) -> None:
 def test_layer_deleted_from_its_menu_is_restored_by_undo(hand: Rig) -> None:
     before = hand.main_view.work.view
     picture = hand.picture()
-    menu(hand, 1, 6)
+    menu(hand, 1, "remove")
     assert names(hand) == ["scarf"]
     assert hand.main_view.work.focus == 0
     assert not np.array_equal(hand.picture(), picture)
@@ -465,11 +466,11 @@ def test_layer_deleted_from_its_menu_is_restored_by_undo(hand: Rig) -> None:
 
 
 def test_layer_menu_renames_and_requests_other_actions(hand: Rig) -> None:
-    menu(hand, 0, 0)
+    menu(hand, 0, "rename")
     type_name(hand, "shawl")
     assert names(hand) == ["shawl", "ears"]
-    menu(hand, 0, 1)
-    menu(hand, 1, 2)
+    menu(hand, 0, "duplicate")
+    menu(hand, 1, "replace")
     assert hand.main_view.take_requests() == (OnItem("duplicate", 0), OnItem("replace", 1))
     toggle(hand, "menu", 0)
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
