@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
@@ -130,11 +131,20 @@ def _check(subject: str, check: Callable[[], Iterable[Finding]]) -> Iterator[Fin
 
 
 def _tests() -> Iterator[Finding]:
-    """Yield the findings of the tests, which share a scene in a temporary folder."""
-    with tempfile.TemporaryDirectory(prefix="progdf-doctor-", ignore_cleanup_errors=True) as name:
-        scene = Path(name) / "ball.ply"
-        scene.write_text(ball_of_gaussians(GAUSSIANS), encoding="ascii")
-        for test in (_drawing, _opengl, _window, _training, _card):
+    """Yield the findings of the tests. Most share a scene in a temporary folder."""
+    with ExitStack() as stack:
+        tests: tuple[Callable[[Path], Finding], ...] = (_drawing, _opengl, _window, _training, _card)
+        scene = Path()
+        try:
+            folder = tempfile.TemporaryDirectory(prefix="progdf-doctor-", ignore_cleanup_errors=True)
+            scene = Path(stack.enter_context(folder)) / "ball.ply"
+            scene.write_text(ball_of_gaussians(GAUSSIANS), encoding="ascii")
+        except OSError as error:
+            where = scene.parent if scene.name else "a temporary folder"
+            reason = error.strerror or error
+            yield Finding("FAILED", "temporary", f"{where} cannot be written: {reason}")
+            tests = (_window, _card)
+        for test in tests:
             yield test(scene)
 
 

@@ -132,15 +132,30 @@ def test_a_check_that_fails_does_not_end_the_report(
         raise error
 
     fine = doctor.Finding("ok", "packages", "fine")
-    for name in ("_system", "_extras", "_processor", "_memory", "_folder", "ball_of_gaussians"):
+    for name in ("_system", "_extras", "_processor", "_memory", "_folder"):
         monkeypatch.setattr(doctor, name, fail)
     monkeypatch.setattr(doctor, "_packages", lambda: [fine])
+    monkeypatch.setattr(doctor, "_tests", lambda: fail())
     assert doctor.main([]) == 2
     lines = capsys.readouterr().out.splitlines()
     assert lines.pop(1) == fine.line()
     assert lines.pop() == "7 failed; a bug report needs all lines above"
     subjects = ("progdf", "extras", "processor", "memory", "cache", "state", "temporary")
     assert lines == [doctor.Finding("FAILED", subject, text).line() for subject in subjects]
+
+
+@pytest.mark.parametrize("fails", ["TemporaryDirectory", "write_text"])
+def test_tests_without_a_scene_run_on_a_full_disk(fails: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> Never:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(*((doctor.tempfile, fails) if fails == "TemporaryDirectory" else (Path, fails)), fail)
+    for name in ("_window", "_card"):
+        monkeypatch.setattr(doctor, name, lambda _, name=name: doctor.Finding("ok", name, ""))
+    full, *others = doctor._tests()
+    assert (full.verdict, full.subject) == ("FAILED", "temporary")
+    assert full.text.endswith("cannot be written: No space left on device")
+    assert [finding.subject for finding in others] == ["_window", "_card"]
 
 
 def test_a_missing_platformdirs_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
