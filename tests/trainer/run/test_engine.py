@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -102,6 +103,20 @@ def test_run_keeps_the_engine_it_began_with(folder: Path) -> None:
         train(quick_options(folder, "kept", engine="warp", resume=True, **asked))
 
 
+@pytest.fixture(scope="module")
+def bear_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Write a small bear before the simulated GPU, on which everything takes ten times as long."""
+    return write_bear(tmp_path_factory.mktemp("bear"), 400)
+
+
+@pytest.fixture
+def bear_folder(bear_files: tuple[Path, Path], tmp_path: Path) -> Path:
+    """Return a folder with the small bear. Request it before `card`."""
+    for path in bear_files:
+        shutil.copy(path, tmp_path)
+    return tmp_path
+
+
 @pytest.fixture
 def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     """Simulate a GPU on which the reference engine replaces warp."""
@@ -123,13 +138,12 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     ],
     ids=["style", "geometry"],
 )
-def test_full_run_works_with_steps_on_a_gpu(tmp_path: Path, card: Card, asked: dict[str, object]) -> None:
+def test_full_run_works_with_steps_on_a_gpu(bear_folder: Path, card: Card, asked: dict[str, object]) -> None:
     """Check that no operation mixes devices and that the result matches the CPU."""
-    write_bear(tmp_path, 400)
-    asked = {"part": "scarf", "views": 4, "image_size": 40} | asked
-    there = train(quick_options(tmp_path, "there", engine="warp", **asked))
+    asked = {"part": "scarf", "views": 4, "image_size": 32} | asked
+    there = train(quick_options(bear_folder, "there", engine="warp", **asked))
     assert card.moved > 0
-    here = train(quick_options(tmp_path, "here", engine="cpu", **asked))
+    here = train(quick_options(bear_folder, "here", engine="cpu", **asked))
     assert there.report["edit"]["psnr_to_views"] == pytest.approx(
         here.report["edit"]["psnr_to_views"], abs=0.02
     )
@@ -180,19 +194,18 @@ def test_saved_state_is_restored_to_the_gpu(card: Card) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "asked",
-    [{}, {"editor": "grade:exposure=0.7"}, {"editor": "stripes:#20a040"}],
+    [{}, {"editor": "grade:exposure=0.7"}, {"editor": "stripes:#20a040", "views": 6}],
     ids=["recolor", "grade", "stripes"],
 )
 def test_colors_are_solved_for_on_a_gpu(
-    tmp_path: Path, card: Card, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object]
+    bear_folder: Path, card: Card, monkeypatch: pytest.MonkeyPatch, asked: dict[str, object]
 ) -> None:
     """Check that no operation mixes devices and that the result matches the CPU."""
     monkeypatch.setattr(resolution, "engine_device", lambda name: CARD if name == "warp" else CPU)
-    write_bear(tmp_path, 400)
-    asked = {"part": "scarf", "views": 6, "image_size": 40, "threads": 1} | asked
-    there = train(quick_options(tmp_path, "there", engine="warp", **asked))
+    asked = {"part": "scarf", "views": 4, "image_size": 40, "threads": 1} | asked
+    there = train(quick_options(bear_folder, "there", engine="warp", **asked))
     assert "colors are solved for, on" in there.folder.log.read_text()
-    here = train(quick_options(tmp_path, "here", engine="cpu", **asked))
+    here = train(quick_options(bear_folder, "here", engine="cpu", **asked))
     assert there.report["edit"]["psnr_to_views"] == pytest.approx(
         here.report["edit"]["psnr_to_views"], abs=0.05
     )
