@@ -13,6 +13,7 @@ from typing import TypeVar
 from imgui_bundle import imgui
 
 from progdf.gdf.file import Gdf
+from progdf.rasterize.first_start import compile_rasterizer, needs_kernels
 from progdf.terminal import escape_text
 from progdf.threads import one_thread
 from viewer.files import exports, user_files
@@ -56,16 +57,18 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
         ProgdfError: see `opens`.
     """
     with interruptible(), ThreadPoolExecutor(2) as workers:
-        preparing = "Preparing to draw …"
+        if needs_kernels("draw"):
+            counted = "Compiling kernels …"
 
-        def report(done: int, total: int) -> None:
-            nonlocal preparing
-            preparing = f"Compiling kernels {done} of {total} …"
+            def report(done: int, total: int) -> None:
+                nonlocal counted
+                counted = f"Compiling kernels {done} of {total} …"
 
-        draws = workers.submit(draw_once, report) if draws_with(splash.context, draw) == "cpu" else None
+            splash.wait(workers.submit(compile_rasterizer, "draw", report), lambda: counted)
+        draws = workers.submit(draw_once) if draws_with(splash.context, draw) == "cpu" else None
         opened, session = splash.wait(workers.submit(opens), "Opening …")
         if draws is not None:
-            splash.wait(draws, lambda: preparing)
+            splash.wait(draws, "Preparing to draw …")
         app = App(Window(splash), opened.document, opened.view, session, draw=draw)
         try:
             app.main_view.restart(opened.view, opened.snapshots)

@@ -14,6 +14,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.picture_camera import camera_chunk, check_camera_file, save_picture_camera
+from progdf.rasterize.first_start import compile_with_bar
 from progdf.terminal import print_line
 from progdf.threads import one_thread
 from viewer.camera import view_camera
@@ -57,6 +58,8 @@ def render(argv: Sequence[str]) -> int:
     saved = None if opened.session is None else view.camera
     stored = opened.document.stored_camera
     framed = opened.document.framed_scene if opened.document.files else None
+    if options.viewpoint.camera is None:
+        compile_with_bar("draw")  # the first view is chosen by small pictures
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored, framed)
     if _is_single(options, view):
         check_camera_file(options.out)

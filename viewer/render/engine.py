@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,8 +25,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.gdf.motions import PartMotions
-from progdf.rasterize.cpu.compilation import count_kernels, is_compiled, mark_compiled
-from progdf.rasterize.first_start import Report, compile_with_bar
+from progdf.rasterize.first_start import compile_with_bar
 from progdf.rasterize.screen import draw_lines_behind
 from progdf.scene.bounds import near_plane
 from viewer.camera.view_camera import Vec3, bounds_of, first_camera, half_camera, to_camera
@@ -40,10 +39,6 @@ from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
 from .live_grade import LiveColors, LiveGrade
 from .view_modes import SPLATS
-
-DRAWING_KERNELS = 9
-"""Number of kernels that `draw_once` calls."""
-
 
 DRAWS = ("auto", "gl", "cpu")
 
@@ -415,19 +410,8 @@ def headless_engine(scene: Gaussians, gdfs: Sequence[Gdf], draws: str) -> Iterat
             ctx.release()
 
 
-def draw_once(report: Report) -> None:
-    """Draw a small picture, which loads the kernels, or compiles them the first time on a machine.
-
-    Args:
-        report: receives the number of compiled kernels and of all; not called if they were compiled before
-    """
-    is_first = not is_compiled(__name__)
-    with count_kernels(DRAWING_KERNELS, report) if is_first else nullcontext():
-        _draw_once()
-    mark_compiled(__name__)
-
-
-def _draw_once() -> None:
+def draw_once() -> None:
+    """Draw a small picture, which loads the kernels, or compiles them the first time on a machine."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     quats = torch.eye(4)[:1].expand(8, 4)
     none = corners[:, None, :][:, :0]

@@ -121,3 +121,16 @@ def test_wait_is_the_current_step_until_it_ends(tmp_path: Path) -> None:
         assert step() == "Editing views 1 of 12"
     log.close()
     assert (tmp_path / "log.txt").read_text("utf-8").count("asks to wait") == 2
+
+
+def test_kernels_are_counted_for_the_window(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", quiet=True, progress=tmp_path / "progress.json")
+    found = []
+    with log.kernels() as report:
+        for done in range(3):
+            report(done, 2)
+            found.append(json.loads((tmp_path / "progress.json").read_text("utf-8")))
+    log.close()
+    assert [(state["label"], state["count"]) for state in found] == [
+        ("Compiling kernels", f"{done} of 2") for done in range(3)
+    ]
