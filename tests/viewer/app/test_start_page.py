@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from imgui_bundle import imgui
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.io.atomic import state_folder
-from tests.helpers.null_app import null_app
+from tests.helpers.null_app import null_app, null_platform
 from tests.helpers.ui_rig import Rig, bear
 from viewer.app import app as application
 from viewer.app.main_view import MainView
@@ -179,6 +180,28 @@ def test_splash_is_shown_while_a_scene_is_read(
     assert window.documents.get().title == "bear.ply"
     assert len(shown) >= 3
     assert shown[0] < 0.3
+
+
+def test_first_start_counts_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    texts: list[str] = []
+    is_drawn = threading.Event()
+
+    def compile_kernels(_: str, report: Callable[[int, int], None]) -> None:
+        report(1, 2)
+        assert is_drawn.wait(60.0)
+
+    def note_text(_: Splash, text: str, __: float) -> None:
+        texts.append(text)
+        if "1 of 2" in text:
+            is_drawn.set()
+
+    monkeypatch.setattr(application, "needs_kernels", lambda _: True)
+    monkeypatch.setattr(application, "compile_rasterizer", compile_kernels)
+    monkeypatch.setattr(Splash, "draw", note_text)
+    monkeypatch.setattr(application.App, "loop", lambda _: None)
+    with null_platform():
+        assert main(["view"]) == 0
+    assert "Compiling kernels 1 of 2 …" in texts
 
 
 def test_invalid_file_or_option_opens_no_window(
