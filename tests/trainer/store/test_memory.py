@@ -27,11 +27,11 @@ print(first, faults())
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs the C library of GNU")
 def test_freed_blocks_of_64_mb_are_reused() -> None:
-    # without huge pages, so that every page is counted
+    # without huge pages; the kernel may still map 16 or 64 kB at once
     environment = {**os.environ, "NUMPY_MADVISE_HUGEPAGE": "0"}
     code = subprocess.run(
         [sys.executable, "-c", _CHECK], capture_output=True, text=True, check=True, env=environment
     )
     first, second = map(int, code.stdout.split())
-    assert first > 10_000
-    assert second < 1_000
+    assert first > 500
+    assert second < 0.06 * first
