@@ -23,7 +23,7 @@ from viewer.state.layers import (
 )
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Workspace, is_compact
-from viewer.ui.context import LAYER_PADDING_PX, PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.context import HALF_GAP_PX, LAYER_PADDING_PX, PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     card,
@@ -189,7 +189,7 @@ def draw_card(
                 imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2
             )
         else:
-            imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * scale)
+            imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - HALF_GAP_PX * scale)
         with inert(layer.locked):
             strength = slider.draw(
                 "##strength",

@@ -27,6 +27,7 @@ from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import HALF_GAP_PX, PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
+    SEPARATOR_PX,
     accent_button,
     elide,
     empty_line,
@@ -82,7 +83,7 @@ def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
     if len(chosen) < 2:
         return 0.0
     spacing = imgui.get_style().item_spacing.y
-    return float(imgui.get_frame_height() + MASTER_PX * ui.scale + 3 * spacing)
+    return float(imgui.get_frame_height() + MASTER_PX * ui.scale + 3 * spacing) + SEPARATOR_PX
 
 
 def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[Action]) -> None:

@@ -106,7 +106,7 @@ def draw(
     ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
     _title(work, facts, ui, actions)
-    footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
+    footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2 + widgets.SEPARATOR_PX
     footer += training_cards.height(work.jobs, ui)
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
     if len(work.view.layers) > cards.SEARCH_THRESHOLD:

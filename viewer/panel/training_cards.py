@@ -10,7 +10,7 @@ from progdf.terminal import format_duration
 from viewer.state.commands import Action, OnItem
 from viewer.state.workspace import JobCard
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
-from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
+from viewer.ui.widgets import SEPARATOR_PX, card, elide, menu_items, right_edge, small, tip, wrapped_text
 
 BAR_PX = 5.0  # height of a progress bar, at 1×
 STRIP_PX = 28.0  # height of the strip, at 1×
@@ -29,7 +29,7 @@ def height(jobs: Sequence[JobCard], ui: UiContext) -> float:
         storage.get_float(imgui.get_id(_HEIGHT_SLOT)) if storage.get_bool(imgui.get_id(_OPEN_SLOT)) else 0.0
     )
     gaps = 3 if cards else 2
-    return float(STRIP_PX * ui.scale + gaps * imgui.get_style().item_spacing.y + cards)
+    return float(STRIP_PX * ui.scale + gaps * imgui.get_style().item_spacing.y + cards) + SEPARATOR_PX
 
 
 def draw(jobs: Sequence[JobCard], ui: UiContext, actions: list[Action]) -> None:

@@ -23,6 +23,7 @@ T = TypeVar("T")
 
 MenuItems = Sequence[str | tuple[str, Action | None, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
+SEPARATOR_PX = 1.0  # height of a line across a list or the panel, at any scale
 LINE_PX = 300.0  # width of the small text in a list's entry, at 1×
 MOVING_OPACITY = 0.6  # of the plates over the picture while a slider moves
 _GRIP_PX = 4.0  # a press that moves no further is a click, at 1×

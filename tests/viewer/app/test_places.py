@@ -20,6 +20,7 @@ from viewer.state.commands import Plain
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import WIDEST_PX, JobCard, Layout
+from viewer.ui.context import LAYER_PADDING_PX, PANEL_PADDING_PX
 
 pytestmark = pytest.mark.gl
 SIZE = (1280, 800)
@@ -151,6 +152,26 @@ def test_layout_is_remembered(tmp_path: Path) -> None:
     (state_folder() / "layout.json").write_text('{"zoom": 99}')
     with null_app(document, ViewState(), tmp_path) as app:
         assert app.main_view.work.layout == Layout(), "what makes no sense is not followed"
+
+
+def test_cards_are_a_multiple_of_8_pixels_apart(hand: Rig) -> None:
+    apart = hand.box("eye", 1).top - hand.box("eye").top
+    assert apart == card.CARD_PX
+    assert apart % 8 == 0.0
+    assert hand.box("##strength").left % 8 == (LEFT + PANEL_PADDING_PX[0] + LAYER_PADDING_PX[0]) % 8
+
+
+def test_footer_keeps_its_place_above_selected_layers_and_jobs(hand: Rig) -> None:
+    place = hand.box("help")
+    hand.key("Ctrl+Alt+A")
+    assert hand.box("help") == place, "below the slider of several layers"
+    job = JobCard(1, "Film film.mp4", Path("/scenes/film.mp4"), "running")
+    hand.main_view.store.replace(replace(hand.main_view.work, jobs=(job,)))
+    hand.frame(3)
+    assert hand.box("help") == place, "below the strip of jobs"
+    hand.click(*hand.at("strip"))
+    hand.frame(3)
+    assert hand.box("help") == place, "below the unfolded cards"
 
 
 def test_jobs_strip_opens_by_click_and_once_by_a_failure(hand: Rig) -> None:

@@ -26,9 +26,9 @@ def tooltip_is_open() -> bool:
     return any(window.active and not window.hidden for window in tips)
 
 
-@pytest.mark.parametrize("place", [(22.0, 617.0), (222.0, 617.0), (272.0, 617.0), (150.0, 109.0)])
-def test_tooltip_opens_after_rest_and_then_nothing_is_drawn(hand: Rig, place: tuple[float, float]) -> None:
-    hand.move(400.0 + place[0], place[1])
+@pytest.mark.parametrize("item", ["undo", "timeline", "help", "name"])
+def test_tooltip_opens_after_rest_and_then_nothing_is_drawn(hand: Rig, item: str) -> None:
+    hand.move(*hand.at(item))
     hand.settle()
     assert not tooltip_is_open()
     hand.rest()
@@ -37,7 +37,7 @@ def test_tooltip_opens_after_rest_and_then_nothing_is_drawn(hand: Rig, place: tu
 
 
 def test_other_frames_do_not_prevent_the_tooltip(hand: Rig) -> None:
-    hand.move(422.0, 617.0)
+    hand.move(*hand.at("undo"))
     hand.settle()
     hand.frame(5)  # for example a picture that sharpens or a message that disappears
     hand.rest()
