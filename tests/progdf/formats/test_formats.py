@@ -251,7 +251,7 @@ def test_missing_package_error_names_the_extra(
     monkeypatch.setattr(formats.importlib.util, "find_spec", lambda module: None)
     path, scene = tmp_path / name, random_gaussians(3)
     for write in (lambda: save_scene(path, scene), lambda: save_frames(path, [scene, scene])):
-        with pytest.raises(ProgdfError, match=rf"^[^\n]*\[{extra}\]$") as caught:
+        with pytest.raises(ProgdfError, match=rf"^[^\n]*\[{extra}\]'$") as caught:
             write()
         assert ".progdf-" not in str(caught.value)
     assert not list(tmp_path.iterdir())
