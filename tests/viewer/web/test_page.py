@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -461,7 +462,11 @@ def test_first_picture_has_few_pixels_and_the_still_stays_until_the_sharp_one(
     opened = ready(open_page(bear_page[0], SHARES))
     marks = opened.tab.evaluate("performance.getEntriesByType('mark').map((mark) => mark.name)")
     assert marks == ["first picture", "sharp picture"]
-    assert opened.tab.evaluate("shares") == [0.25, 1]
+    shares = opened.tab.evaluate("shares")
+    assert [share for share, _ in groupby(shares)] == [
+        0.25,
+        1,
+    ]  # a frame is repeated if the page's size comes late
 
 
 @pytest.mark.parametrize("size", [(660, 400), (390, 720)], ids=["beside the panel", "phone"])
