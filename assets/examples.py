@@ -19,8 +19,9 @@ from progdf.demo_scenes import DemoScene
 from progdf.formats.packed.compressed_ply import morton_order, write_compressed_ply
 from progdf.formats.scene_file import load_scene
 from progdf.gdf.header import pack_file, unpack_file
+from progdf.io.bundle import BUNDLE, write_bundle
 from progdf.io.cameras import load_cameras
-from progdf.io.session import BUNDLE, SUFFIX, write_bundle
+from progdf.io.session import SUFFIX
 from trainer.run import demo
 from viewer.camera.view_camera import Vec3, bounds_of, first_camera, from_camera
 from viewer.files import document, session

@@ -1,4 +1,4 @@
-"""Test of assets/tour.py, which takes the pictures of the window in the documents."""
+"""Tests of the scripts in assets/, and of assets/tour.py, which takes the pictures of the window."""
 
 from __future__ import annotations
 
@@ -14,6 +14,15 @@ from tests.helpers.ui_rig import bear
 
 TOUR: dict[str, Any] = runpy.run_path(str(ROOT / "assets" / "tour.py"))
 SHOTS = [pytest.param(shot, marks=() if shot == "select" else pytest.mark.slow) for shot in TOUR["SHOTS"]]
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "assets").glob("*.py")), ids=lambda script: script.stem)
+def test_script_imports_names_that_exist(script: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scripts are outside the packages that mypy checks."""
+    monkeypatch.syspath_prepend(script.parent)
+    if "playwright" in script.read_text(encoding="utf-8"):
+        pytest.importorskip("playwright")
+    runpy.run_path(str(script))
 
 
 def test_every_picture_of_the_tour_has_a_shot() -> None:
