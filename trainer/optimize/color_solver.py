@@ -523,7 +523,9 @@ def choose_model(
     degrees = (0,) if few and mean_errors[0] <= min(mean_errors.values()) else MONOMIALS
     by_degree = [search.attempt(bases[degree], bases[degree].name, 0, _RESIDUAL_RIDGE) for degree in degrees]
     best = last = _smallest(by_degree, lambda one: one.degree)
-    for name, bands, hold in search.residuals:
+    # where a residual cannot gain enough above one level of 8 bits, none is solved for
+    can_gain = few or limits.max_error_share * best.error > LEVEL
+    for name, bands, hold in search.residuals if can_gain else ():
         last = search.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
@@ -540,15 +542,13 @@ def choose_model(
         best = replace(best, mask_hold=TIED_RIDGES[0])
     if few:  # members that no picture shows follow the map, masked or not
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
-    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
-    tried = [(one.name, decibels(one.error)) for one in search.tried]
     model = Model(
         degree=best.degree,
         hold=best.hold,
         residual=residual,
-        mask=mask,
+        mask=(chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None,
         error=best.error,
-        tried=tried,
+        tried=[(one.name, decibels(one.error)) for one in search.tried],
         steps=search.steps,
         most_bands=most_bands,
         map_error=min(one.error for one in by_degree),
