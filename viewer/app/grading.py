@@ -78,8 +78,17 @@ class GradePreview:
         return f"{form.region}|{form.typed_region}|{hash(work.view.selection.members)}"
 
     def take(self, sample: RegionSample, palette: Sequence[str], region: str) -> None:
-        """Take over the sample and the main colors of a region, unless the form has another one by now."""
+        """Take over the sample and the main colors of a region, unless the form has another one by now.
+
+        `sample`: its rows are those of the scene that holds the region
+        """
         if region == self.region_key():
+            work = self._store.get()
+            try:
+                own = region_files.own_scene(work.form, self._documents.get(), work.view.selection)
+            except ProgdfError:  # of several scenes, others are visible by now
+                return
+            sample = replace(sample, rows=sample.rows + own.rows.start)
             self._region = region
             self._grader.sample = sample
             rows = self._grader.rows

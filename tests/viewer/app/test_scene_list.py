@@ -19,8 +19,10 @@ from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
 from viewer.files import session
+from viewer.jobs.preview_process import RegionSample
 from viewer.state import selection
 from viewer.state.commands import OnItem, Plain, WithText
+from viewer.state.forms import SELECTION, with_settings
 from viewer.state.transient import Gizmo
 from viewer.state.view_state import SceneState
 from viewer.state.workspace import with_transient
@@ -75,6 +77,27 @@ def test_scene_is_added_hidden_and_shown_with_undo(app: App) -> None:
     assert not opacities(app)[first : first + COUNT].any()
     press(app, "Ctrl+Y")
     assert torch.equal(opacities(app), before)
+
+
+def test_grade_of_the_second_scene_leaves_the_first_unchanged(app: App) -> None:
+    first = len(bear().scene)
+    total = first + COUNT
+    work = app.store.get()
+    mask = np.arange(total) >= first
+    view = replace(work.view, selection=selection.select(work.view.selection, mask))
+    form = with_settings(work.form, "grade:exposure=1")
+    assert form is not None
+    form = replace(form, region=SELECTION)
+    app.store.replace(replace(work, view=view, form=form, form_open=True))
+    grading = app.parts.preview._grading
+    grading.update()
+    blank = np.zeros((4, 4, 3), np.float32)
+    own_rows = np.arange(COUNT)  # the preview process has the second scene alone
+    sample = RegionSample(own_rows, blank[0], blank[0, :, 0], blank, blank, blank[..., 0])
+    grading.take(sample, (), grading.region_key())
+    grading.update()
+    assert app.engine.live is not None
+    assert app.engine.live.rows.tolist() == list(range(first, total))
 
 
 def test_moved_scene_is_placed_without_a_layer(app: App) -> None:
