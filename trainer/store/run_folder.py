@@ -236,20 +236,22 @@ def remove_refused_run(folder: RunFolder) -> Iterator[None]:
     it takes long to make. A folder that held a run before stays as it is.
     """
     root = folder.root
-    is_new = not folder.log.exists()
-    missing = [path for path in (root, *root.parents) if not path.exists()]
+    is_new = not os.path.lexists(folder.log)
+    missing = [path for path in (root, *root.parents) if not os.path.lexists(path)]
     try:
         yield
     except ResumableError:
         raise
     except ProgdfError:
-        if is_new and not _has_work(folder):
+        if is_new and not (os.path.isdir(root) and _has_work(folder)):
             with contextlib.suppress(OSError, ProgdfError):
-                with lock_folder(folder):
-                    _remove_refused_files(folder)
-                (root / atomic.LOCK).unlink(missing_ok=True)
+                if os.path.isdir(root):
+                    with lock_folder(folder):
+                        _remove_refused_files(folder)
+                    (root / atomic.LOCK).unlink(missing_ok=True)
                 for path in missing:
-                    path.rmdir()
+                    if os.path.isdir(path):
+                        path.rmdir()
         raise
 
 

@@ -92,16 +92,23 @@ def order(scene: Path, name: str, region: str = "all") -> EditOrder:
     return EditOrder(scene, out, name, region, "tint:#3060d0", quick=True, threads=1)
 
 
-def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
-    """Poll until nothing is busy or a job has the label `until`; return the finished tasks."""
+def wait(queue: JobQueue) -> list[QueuedTask]:
+    """Poll until nothing is busy; return the finished tasks."""
     ended = []
     begun = time.monotonic()
     while queue.busy() and time.monotonic() - begun < PATIENCE_S:
         ended += queue.poll()
-        if until and any(job.progress.label == until for job in queue.jobs):
-            break
         time.sleep(0.05)
     return ended
+
+
+def wait_for_progress(queue: JobQueue) -> None:
+    """Poll until the file of the running job shows progress. The queue itself reads it once a second."""
+    begun = time.monotonic()
+    while (job := queue.busy()) and not job.task.read_progress(job.progress).share:
+        assert not queue.poll()
+        assert time.monotonic() - begun < PATIENCE_S
+        time.sleep(0.01)
 
 
 @pytest.mark.slow
@@ -135,7 +142,7 @@ def test_runs_train_in_order_and_a_failure_is_one_line(scene: Path, monkeypatch:
 def test_stopped_run_resumes_in_a_new_queue(scene: Path) -> None:
     queue = JobQueue()
     number = queue.add(order(scene, "blue"))
-    wait(queue, until="Editing views")
+    wait_for_progress(queue)
     queue.stop(number)
     (stopped,) = wait(queue)
     queue.close()
