@@ -317,9 +317,21 @@ def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> 
 
 
 def _small_view(setup: TrainingSetup, view: View, picture: Tensor) -> tuple[CropScene, Tensor, Tensor]:
-    """Return the small scene to render, its target picture, and the mask of the counted pixels."""
-    scene, shrink, counting = shrink_view(setup, view, picture, fit_size(view.camera, _SMALL_SIDE_PX))
-    return scene, shrink(picture), counting[..., 0] > 0.5
+    """Return the small scene to render, its target picture, and the mask of the counted pixels.
+
+    A shrunk picture differs from a small render, also where nothing is edited. The target is therefore the
+    small render of the original with the shrunk change.
+    """
+    camera = fit_size(view.camera, _SMALL_SIDE_PX)
+    scene, shrink, counting = shrink_view(setup, view, picture, camera)
+    target = shrink(picture)
+    if camera.width < view.camera.width:
+        with torch.no_grad():
+            unedited = scene.render(
+                pack(setup.scene[setup.region.members], with_shN=setup.scene.sh_degree > 0)
+            )
+        target = (unedited + target - shrink(view.image)).clamp(0.0, 1.0)
+    return scene, target, counting[..., 0] > 0.5
 
 
 def _psnr(small: Evaluator, offsets: Tensor) -> float:
